@@ -99,56 +99,87 @@ def lattice() -> Lattice:
     return Lattice(points, nodes, surface_embedding.vertex_area(flat, Delaunay(nodes).simplices))
 
 
-def solve(tissue: TissueKind, components: int) -> Floats:
+def solve(tissue: TissueKind, components: int, *, alone: bool = False) -> Floats:
     """Displacement (C P, 3 K) mm of a tissue of E = 1 kPa under unit loads [mN].
 
     Rows: x of every point, then y, then in stereo z (C = 3); columns: loads along x at every node, then y, z.
+    `alone`: no other tissue of this Poisson's ratio is expected, so that nothing is kept for it, at half the
+    cost of the first.
     """
-    surface = _condense("free" if tissue.edge == "free" else "held", tissue.poisson)
-    window, rows = len(surface.loads), components * len(lattice().points)
-    rest = slice(len(surface.stiffness) - window)  # of the surface, around the window
-    within = slice(rest.stop, None)
-    added = surface.assemble_added(tissue)
-
-    def part(rows: slice, columns: slice, kind: type[np.floating]) -> NDArray[np.floating]:
-        dense, sparse = surface.stiffness[rows, columns].astype(kind), sp.coo_array(added[rows, columns])
-        dense[sparse.row, sparse.col] += sparse.data.astype(kind)
-        return dense
-
-    # What surrounds the window is eliminated in single precision, at half the cost and with errors of 1e-6.
-    # All are symmetric or of one triangle, in Fortran's order: BLAS copies and mirrors nothing.
-    root = cholesky(part(rest, rest, np.float32).T, lower=True, overwrite_a=True, check_finite=False)
-    taken = strsm(1.0, root, part(within, rest, np.float32).T, lower=1, overwrite_b=1)
-    held = part(within, within, np.float64).T
-    held -= ssyrk(1.0, taken, trans=1, lower=1)
+    block: Block = "free" if tissue.edge == "free" else "held"
+    geometry, rows = _geometry(block), components * len(lattice().points)
+    held = _hold_alone(geometry, tissue) if alone else _hold(_condense(block, tissue.poisson), tissue)
     root = cholesky(held, lower=True, overwrite_a=True, check_finite=False)
-    moved = dtrsm(1.0, root, surface.loads, lower=1)
+    moved = dtrsm(1.0, root, geometry.loads, lower=1)
     moved = dtrsm(1.0, root, moved, lower=1, trans_a=1, overwrite_b=1)
-    return np.asarray(surface.observed[:rows] @ moved, np.float64)
+    return np.asarray(geometry.observed[:rows] @ moved, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
-    """A block of one Poisson's ratio, without skull or membrane, with all below its surface eliminated.
+class _Geometry:
+    """A block: what depends on no Poisson's ratio.
 
     Its nodes are those of the surface and, last, the window: those that bear the loads or move the points.
     """
 
     volumes: dict[Edge, Tets]  # by edge: one mesh, with the skull's springs
     nodes: Ints  # (S,) of the volume
-    stiffness: Floats  # (3 S, 3 S) mN/mm
     observed: Floats  # (3 P, 3 W) motion of the points, x, y, z in turn, by that of the window's nodes
     loads: Floats  # (3 W, 3 K) forces on the window's nodes by unit loads
 
+    def assemble_tissue(self, poisson: float) -> sp.csr_array:
+        """The stiffness of the volume without skull or membrane, (3 N, 3 N) mN/mm."""
+        volume = next(iter(self.volumes.values()))
+        return tissue_stiffness(quadrature(volume.points, volume.cells), poisson)[0]
+
     def assemble_added(self, tissue: TissueKind) -> sp.csr_array:
-        """What skull and membrane add to the stiffness, (3 S, 3 S) mN/mm."""
+        """What skull and membrane add to it, (3 N, 3 N) mN/mm: to nodes of the surface alone."""
         volume = self.volumes[tissue.edge]
         stiffness = springs(volume)
         if tissue.membrane:
             sheet = MembraneSheet(tissue.membrane, tissue.stretch)
             stiffness = stiffness + lay(volume, sheet, linear=tissue.stretch <= 1).rest_stiffness()
-        rows = degrees_of_freedom(self.nodes)
-        return sp.csr_array(stiffness.tocsr()[rows][:, rows])
+        return stiffness.tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """The stiffness of a block without skull or membrane, with all below its surface eliminated.
+
+    In Fortran's order, and that of the nodes around the window in single precision.
+    """
+
+    geometry: _Geometry
+    rest: NDArray[np.float32]  # (3 R, 3 R) mN/mm, of the nodes around the window
+    across: NDArray[np.float32]  # (3 R, 3 W) from the window to them
+    window: Floats  # (3 W, 3 W)
+
+
+def _hold(surface: _Surface, tissue: TissueKind) -> Floats:
+    """The stiffness (3 W, 3 W) of the window under skull and membrane; only the lower triangle is right."""
+    rows = degrees_of_freedom(surface.geometry.nodes)
+    added = surface.geometry.assemble_added(tissue)[rows][:, rows]
+    rest, within = slice(len(surface.rest)), slice(len(surface.rest), None)
+
+    def add(dense: NDArray[np.floating], part: sp.csr_array) -> NDArray[np.floating]:
+        total, sparse = dense.copy(order="F"), sp.coo_array(part)
+        total[sparse.row, sparse.col] += sparse.data.astype(total.dtype)
+        return total
+
+    # What surrounds the window is eliminated in single precision, at half the cost and with errors of 1e-6.
+    # All are symmetric or of one triangle, in Fortran's order: BLAS copies and mirrors nothing.
+    root = cholesky(add(surface.rest, added[rest, rest]), lower=True, overwrite_a=True, check_finite=False)
+    taken = strsm(1.0, root, add(surface.across, added[rest, within]), lower=1, overwrite_b=1)
+    held = add(surface.window, added[within, within])
+    held -= ssyrk(1.0, taken, trans=1, lower=1)
+    return held
+
+
+def _hold_alone(geometry: _Geometry, tissue: TissueKind) -> Floats:
+    """The same by eliminating all but the window, without the step over the surface."""
+    volume, window = geometry.volumes[tissue.edge], geometry.nodes[-(len(geometry.loads) // 3) :]
+    stiffness = geometry.assemble_tissue(tissue.poisson) + geometry.assemble_added(tissue)
+    return condense(stiffness, volume.points, volume.cells, window, volume.fixed).T
 
 
 Block = Literal["held", "free"]
@@ -156,16 +187,17 @@ Block = Literal["held", "free"]
 
 @lru_cache(maxsize=1)
 def _condense(block: Block, poisson: float) -> _Surface:
-    volumes, nodes, observed, loads = _geometry(block)
-    volume = next(iter(volumes.values()))
-    tissue, _ = tissue_stiffness(quadrature(volume.points, volume.cells), poisson)
-    stiffness = condense(tissue, volume.points, volume.cells, nodes, volume.fixed)
-    return _Surface(volumes, nodes, stiffness, observed, loads)
+    geometry = _geometry(block)
+    volume = next(iter(geometry.volumes.values()))
+    tissue = geometry.assemble_tissue(poisson)
+    whole = condense(tissue, volume.points, volume.cells, geometry.nodes, volume.fixed).T
+    rest, within = slice(len(whole) - len(geometry.loads)), slice(len(whole) - len(geometry.loads), None)
+    single = (np.asfortranarray(whole[rest, part], np.float32) for part in (rest, within))
+    return _Surface(geometry, *single, np.asfortranarray(whole[within, within]))
 
 
 @lru_cache(maxsize=1)
-def _geometry(block: Block) -> tuple[dict[Edge, Tets], Ints, Floats, Floats]:
-    """What of a `_Surface` depends on no Poisson's ratio: volumes, nodes, observed, loads."""
+def _geometry(block: Block) -> _Geometry:
     edges: tuple[Edge, ...] = ("free",) if block == "free" else ("bonded", "slipping")
     volumes, where = {edge: _mesh(_TETS, edge) for edge in edges}, lattice()
     volume = volumes[edges[0]]
@@ -175,7 +207,7 @@ def _geometry(block: Block) -> tuple[dict[Edge, Tets], Ints, Floats, Floats]:
     surface = np.setdiff1d(tetrahedra.boundary(volume.cells), window)
     nodes = np.concatenate([surface[~volume.fixed[surface]], window])
     observed, loads = (_motion(each, window) for each in embedded)
-    return volumes, nodes, observed, loads.T  # in Fortran's order
+    return _Geometry(volumes, nodes, observed, loads.T)  # in Fortran's order
 
 
 def _motion(embedding: Embedding, window: Ints) -> Floats:

@@ -8,7 +8,7 @@ between them take the gain over the linear force that these show.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -27,7 +27,7 @@ from bench.methods.method_interface import (
     MethodContext,
     widen_small_forces,
 )
-from bench.methods.posterior import Observation, Posterior
+from bench.methods.posterior import LoadBasis, Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
@@ -267,13 +267,24 @@ def weigh_tissues(
     strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [frame for frame in strongest if frame.size_mm > 0]
 
-    def evidence(tissue: TissueKind) -> float:
-        basis = posterior.load_basis(len(own_mm), tissue)
+    def evidence(tissue: TissueKind, load: Callable[..., LoadBasis] = posterior.load_basis) -> float:
+        basis = load(len(own_mm), tissue)
         return TISSUES.temper * sum(posterior.evidence(basis, frame, own_mm) for frame in strongest)
 
-    tissues = list(candidate_tissues(scene))
-    prior = _prior(tissues, scene.membrane)
-    score = [evidence(tissue) + np.log(share) for tissue, share in zip(tissues, prior, strict=True)]
+    candidates = candidate_tissues(scene)
+    logs = dict(zip(candidates, np.log(_prior(candidates, scene.membrane)), strict=True))
+    known: dict[TissueKind, float] = {}  # those of the candidates that are computed
+
+    def posterior_log(tissue: TissueKind) -> float:
+        if tissue not in known:
+            known[tissue] = evidence(tissue) + logs[tissue]
+        return known[tissue]
+
+    for part in (False, True):
+        if group := [each for each in candidates if (each.membrane > 0) is part]:
+            find_largest(group, posterior_log)
+    tissues = list(known)
+    score = [known[tissue] for tissue in tissues]
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
@@ -281,15 +292,43 @@ def weigh_tissues(
     score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
     for nu in others:
         tissues.append(replace(tissues[best], poisson=nu))
-        score.append(score[best] + evidence(tissues[-1]) - first)
+        score.append(score[best] + evidence(tissues[-1], posterior.load_basis_alone) - first)
     weight = np.maximum(softmax(score), TISSUES.unlikely)
     # The interval is to hold the most likely tissue with and without a membrane, and each Poisson's ratio.
-    known = len(tissues) - len(others)
-    parts = [[k for k in range(known) if (tissues[k].membrane > 0) is covered] for covered in (False, True)]
-    used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(known, len(tissues))}
+    covered = [tissue.membrane > 0 for tissue in known]
+    parts = [[k for k in range(len(known)) if covered[k] is part] for part in (False, True)]
+    used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(len(known), len(tissues))}
     order = sorted(used, key=lambda k: -weight[k])
     weight = weight[order] / weight[order].sum()
     return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed)
+
+
+def find_largest(candidates: Sequence[TissueKind], value: Callable[[TissueKind], float]) -> TissueKind:
+    """The candidate of the largest value, by a search uphill that looks at half of them.
+
+    Along the membrane's stiffness evidence has one maximum, which is another one for each edge.
+    """
+    stiffness = sorted({each.membrane for each in candidates})
+
+    def climb(tissue: TissueKind) -> TissueKind:
+        for step in (-1, 1):
+            place = stiffness.index(tissue.membrane) + step
+            while 0 <= place < len(stiffness):
+                beside = replace(tissue, membrane=stiffness[place])
+                if value(beside) <= value(tissue):
+                    break
+                tissue, place = beside, place + step
+        return tissue
+
+    middle = stiffness[len(stiffness) // 2]
+    last, best = None, climb(next(each for each in candidates if each.membrane == middle))
+    while best != last:
+        last = best
+        edges = [each for each in candidates if replace(each, edge=best.edge) == best]
+        best = max((best, *map(climb, edges)), key=value)
+        stretches = [each for each in candidates if replace(each, stretch=best.stretch) == best]
+        best = climb(max((best, *stretches), key=value))
+    return best
 
 
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:

@@ -111,14 +111,7 @@ class Posterior:
 def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     """The reduced compliance of a tissue, observed in 2 or 3 components: from this user's cache, or computed
     (half a CPU-second, and one for each block and Poisson's ratio) and stored there."""
-    kept = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
-    key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {kept}".encode()
-    faults = ValueError, EOFError, KeyError, BadZipFile  # of files that were cut off: they are computed again
-    with say_if_long(_WAIT):
-        stored = cache.cached(
-            "basis/npz", key, lambda: _reduce(components, tissue), _dump, _load, faults, _STORED
-        )
-    lattice = compliance.lattice()
+    stored, lattice = _stored_basis(components, tissue), compliance.lattice()
     shares = _contact_shares(lattice)
     near = np.square(lattice.points[:, None] - lattice.points[None]).sum(axis=-1)
     near = np.exp(-near / (2 * MODEL.around_mm**2))
@@ -136,14 +129,32 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     )
 
 
-_WAIT = "physics: computing how tissue yields under loads, once on this machine (some 15 s of a processor)"
+@lru_cache(maxsize=8)
+def load_basis_alone(components: int, tissue: TissueKind) -> LoadBasis:
+    """The same for a tissue that is likely to be the only one of its Poisson's ratio: computed at half the
+    cost of a first one."""
+    _stored_basis(components, tissue, alone=True)
+    return load_basis(components, tissue)
+
+
+def _stored_basis(components: int, tissue: TissueKind, *, alone: bool = False) -> dict[str, Any]:
+    kept = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
+    key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {kept}".encode()
+    faults = ValueError, EOFError, KeyError, BadZipFile  # of files that were cut off: they are computed again
+    with say_if_long(_WAIT):
+        return cache.cached(
+            "basis/npz", key, lambda: _reduce(components, tissue, alone), _dump, _load, faults, _STORED
+        )
+
+
+_WAIT = "physics: computing how tissue yields under loads, once on this machine (some 10 s of a processor)"
 _STORED = 128  # bases in the cache, of some 1.5 MB: those of five recordings about which nothing is stated
 
 
-def _reduce(components: int, tissue: TissueKind) -> dict[str, Any]:
+def _reduce(components: int, tissue: TissueKind, alone: bool = False) -> dict[str, Any]:
     """What of a `LoadBasis` depends on the tissue, by attribute; large arrays in single precision."""
     lattice = compliance.lattice()
-    matrix, count, rank = compliance.solve(tissue, components), len(lattice.nodes), MODEL.rank
+    matrix, count, rank = compliance.solve(tissue, components, alone=alone), len(lattice.nodes), MODEL.rank
     apart = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
     kernel = np.exp(-apart / (2 * MODEL.smooth_mm**2)) * lattice.node_area[:, None] * lattice.node_area
     root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))

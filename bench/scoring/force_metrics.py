@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from sklearn.metrics import f1_score
 
 from bench import bootstrap
 from bench.bootstrap import Interval
@@ -161,9 +160,10 @@ def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> di
     """Scores of contact detection, as `METRICS` describes them."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
     truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
-    free = ~truth
+    free, hits, named = ~truth, int((truth & found).sum()), int(truth.sum() + found.sum())
     return {
-        "contact_f1": float(f1_score(truth, found)) if (truth | found).any() else math.nan,
+        # By its definition: importing scikit-learn for it took a fifth of the start of every command.
+        "contact_f1": 2 * hits / named if named else math.nan,
         "false_positive_rate": float(found[free].mean()) if free.any() else math.nan,
     }
 

@@ -13,9 +13,6 @@ from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import FiniteFloat
-from scipy.cluster.hierarchy import DisjointSet
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.distance import cdist
 
 from synth.dataset.dataset_folder import write_whole
 from synth.errors import UserError
@@ -198,11 +195,19 @@ def join_groups(*keys: Sequence[Hashable]) -> list[int]:
 
     `keys`: properties that must not be on two sides, one value per sequence each.
     """
-    joined, first = DisjointSet(range(len(keys[0]))), dict[Hashable, int]()
+    # By hand, as every command would import SciPy's clustering for it: a quarter of its start.
+    group, first = [*range(len(keys[0]))], dict[Hashable, int]()
+
+    def root(k: int) -> int:
+        while group[k] != k:
+            group[k] = k = group[group[k]]
+        return k
+
     for which, values in enumerate(keys):
         for k, value in enumerate(values):
-            joined.merge(k, first.setdefault((which, value), k))
-    return [first.setdefault(joined[k], k) for k in range(len(keys[0]))]
+            low, high = sorted((root(k), root(first.setdefault((which, value), k))))
+            group[high] = low
+    return [root(k) for k in range(len(group))]
 
 
 def name_anatomy(attrs: Mapping[str, Any]) -> str:
@@ -230,6 +235,9 @@ def _join_openings(names: Sequence[str], apart_mm: float) -> list[str]:
     if not placed:
         return list(names)
     brains, places = zip(*(name.split(" at ") for name in placed), strict=True)
+    from scipy.sparse.csgraph import connected_components  # of brains of users alone
+    from scipy.spatial.distance import cdist
+
     apart = cdist(*[np.array([place.split(",") for place in places], float)] * 2)
     same = np.array(brains)[:, None] == np.array(brains)
     part = connected_components(same & (apart < apart_mm))[1].tolist()

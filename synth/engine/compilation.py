@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from synth.dataset import provenance
-from synth.system import cache, jit, packages
+from synth.system import cache, packages, target_processor
 
 _ALL_S = 14  # CPU seconds, measured with an empty cache on a processor of 2023
 _MOST = 4  # processes: more would be busy importing
@@ -48,12 +48,18 @@ def compile_once(environment: Mapping[str, str], processes: int, tell: Callable[
 
 def _key() -> str:
     """A word for all that numba's own cache depends on."""
-    about = packages.versions(), jit.target(), str(provenance.HOME), os.environ.get("NUMBA_CACHE_DIR")
+    about = (
+        packages.versions(),
+        target_processor.target(),
+        str(provenance.HOME),
+        os.environ.get("NUMBA_CACHE_DIR"),
+    )
     return hashlib.sha256(repr((provenance.code("synth"), *about)).encode()).hexdigest()[:16]
 
 
 if __name__ == "__main__":
     gc.disable()  # a tenth faster
     import synth.sequence.pipeline  # noqa: F401  # all modules with loops
+    from synth.system import jit
 
     jit.compile_loops(int(sys.argv[1]), int(sys.argv[2]))

@@ -12,19 +12,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from llvmlite import binding
 from numba.core.sigutils import normalize_signature
 
 from synth.arrays import Array
-from synth.system import cache
+from synth.system import cache, target_processor
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOOPS: list[tuple[Any, str]] = []
 """Loops and the types of their arguments, of the modules that are imported, see `argument_types`."""
-
-_TARGET = "x86-64-v3"
-_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # of it, beyond those of v2
 
 
 def compiled(function: F, **how: str) -> F:
@@ -81,21 +77,9 @@ def compile_loops(part: int, parts: int) -> None:
         function.compile(normalize_signature(f"({types})")[0])
 
 
-def target() -> str:
-    """The processor that loops are compiled for.
-
-    It is x86-64-v3 where that runs, so that such machines compute the same bits and can share a cache; as
-    fast as the host's own name here. `NUMBA_CPU_NAME` overrides it.
-    """
-    name: str | None = numba.config.CPU_NAME
-    return name or str(binding.get_host_cpu_name())
-
-
 def _choose_target() -> None:
-    with suppress(RuntimeError):  # LLVM doesn't know this processor
-        has = binding.get_host_cpu_features()
-        if numba.config.CPU_NAME is None and all(has.get(name) for name in _FEATURES):
-            numba.config.CPU_NAME, numba.config.CPU_FEATURES = _TARGET, ""
+    if numba.config.CPU_NAME is None and target_processor.has_common():
+        numba.config.CPU_NAME, numba.config.CPU_FEATURES = target_processor.COMMON, ""
 
 
 _choose_target()

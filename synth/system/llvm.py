@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+
+from synth.system import cache, packages, target_processor
 
 _PACKAGE = "karellen-llvm-core"  # a dependency on x86-64 Linux: no other package is one library
 _OLDEST = 17  # drjit 1.5 aborts with 15 and 16 and refuses 14
@@ -57,15 +61,29 @@ def candidates() -> list[str]:
 
 
 def probe(path: str) -> bool:
-    """Whether a small kernel runs with the LLVM at `path`, tested in a process that may crash."""
+    """Whether a small kernel runs with the LLVM at `path`, tested in a process that may crash.
+
+    Once: that this file works with these packages on this processor is noted in the user's cache.
+    """
     if not Path(path).exists():
         return False
+    about = Path(path).stat()
+    known = path, about.st_size, about.st_mtime_ns, packages.versions(), target_processor.target()
+    note: Path | None = None
+    with suppress(OSError):  # nowhere to note it
+        note = cache.folder("llvm") / f"works-{hashlib.sha256(repr(known).encode()).hexdigest()[:16]}"
+        if note.exists():
+            return True
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}
     call = [sys.executable, "-c", _PROBE]
     try:
-        return not subprocess.run(call, env=environment, capture_output=True, timeout=120).returncode
+        works = not subprocess.run(call, env=environment, capture_output=True, timeout=120).returncode
     except subprocess.TimeoutExpired:
         return False
+    if works and note:
+        with suppress(OSError):  # a full disk
+            note.touch()
+    return works
 
 
 def _linker() -> list[Path]:

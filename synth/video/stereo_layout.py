@@ -65,31 +65,35 @@ def _find_mixed(pictures: Sequence[Pixels]) -> str:
     Of the four pictures of every second pixel, two pairs are then of one camera each. Two fields of an
     interlaced video differ likewise where the picture moves, but by half as much as from picture to picture.
     """
-    found = [_mixed_layout(pictures[k]) for k in {0, len(pictures) // 2, len(pictures) - 1}]
-    if len(set(found)) > 1 or not found[0]:
+    layout, later = _mixed_layout(pictures[0]), {len(pictures) // 2, len(pictures) - 1} - {0}
+    if not layout or any(_mixed_layout(pictures[k]) != layout for k in later):
         return ""
-    if found[0] == "rows" and len(pictures) > 1:
+    if layout == "rows" and len(pictures) > 1:
         fields = [[_smooth(rgb[k::2, ::2, 1]) for k in (0, 1)] for rgb in pictures[:3]]
         apart = [_shift(even, odd)[1] for even, odd in fields]
         moved = [_shift(a[0], b[0])[1] for a, b in itertools.pairwise(fields)]
         if max(moved) > _FIELDS * min(apart):
             return ""
-    return found[0]
+    return layout
 
 
 def _mixed_layout(rgb: Pixels) -> str:
     height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
     green = rgb[:height, :width, 1]
     first, right, below, across = (_smooth(green[k::2, j::2]) for k in (0, 1) for j in (0, 1))
-    apart = [bool(np.prod(_shift(first, other) >= _SURE)) for other in (right, below, across)]
+    apart = [_differ(first, right), _differ(first, below)]
+    if any(apart):  # else it is none of these
+        apart.append(_differ(first, across))
     for name, pattern in (("rows", [0, 1, 1]), ("columns", [1, 0, 1]), ("checkerboard", [1, 1, 0])):
         if apart == pattern:
             return name if _finest_power(green, _FINEST[name]) > _REPLICA else ""
     red, same, blue = (_smooth(rgb[..., k], 4.0) for k in range(3))
-    by_colour = [
-        bool(np.prod(_shift(one, other) >= _SURE)) for one, other in ((red, same), (red, blue), (same, blue))
-    ]
-    return "anaglyph" if by_colour == [True, True, False] else ""
+    by_colour = _differ(red, same) and _differ(red, blue) and not _differ(same, blue)
+    return "anaglyph" if by_colour else ""
+
+
+def _differ(one: Array, other: Array) -> bool:
+    return bool(np.all(_shift(one, other) >= _SURE))
 
 
 def _finest_power(channel: Array, place: tuple[float, float]) -> float:

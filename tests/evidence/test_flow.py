@@ -82,7 +82,7 @@ def track(shown: Sequence[Frame], masks: str) -> tuple[float, float]:
     return float(np.mean(error)), float(np.nanmean(covered))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_detected_masks_help_on_average_of_the_tuning_half() -> None:
     videos = [list(video(one, 160, 8)) for one in recipes("tuning", 12)]
     detected, covered = zip(*(track(shown, "auto") for shown in videos), strict=True)

@@ -33,8 +33,8 @@ def test_the_surface_interpolates_levels_and_nodes() -> None:
         assert np.abs(found[..., :2]).max() < 1e-12
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pulse", pytest.param("two", marks=pytest.mark.trial)])
+@pytest.mark.trial
+@pytest.mark.parametrize("kind", ["pulse", "two"])
 def test_a_recording_contains_the_prescribed_force(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -100,7 +100,7 @@ def test_a_swapped_camera_moves_the_stereo_probe(monkeypatch: pytest.MonkeyPatch
     assert change("stereo", before, probes.probe_stereo()).moved
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_comments_and_names_and_folders_are_not_seen(tmp_path: Path) -> None:
     """The same code without comments and docstrings, from another folder, gives the same sketches."""
     for package in ("synth", "learn", "bench", "evidence"):
@@ -118,11 +118,12 @@ def test_comments_and_names_and_folders_are_not_seen(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.trial] * (name == "score")) for name in PROBES]
+    "name", [pytest.param(name, marks=[pytest.mark.trial] * name.startswith("score")) for name in PROBES]
 )
-def test_a_probe_is_as_stored(name: str) -> None:
+def test_a_probe_is_as_stored(name: str, request: pytest.FixtureRequest) -> None:
     """Or `make guard ACCEPT=1`, after its version was raised, says what this change moves."""
-    ((_, sketches),) = guard.run_probes([name], workers=1)
+    fixture = name in ("truth", "picture")
+    sketches = sketch_all(request.getfixturevalue(name)) if fixture else guard.run_probe(name)
     (found,) = guard.compare(guard.stored(), {name: sketches})
     assert not found.moved, found.text()
 

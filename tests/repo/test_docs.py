@@ -120,6 +120,8 @@ def test_percentages_in_a_sentence_that_links_to_a_result_are_on_its_page(page: 
 
 
 HOWTO = ("instruments", "mechanics", "export", "camera", "models", *PLUG_INS)
+LONG = ("models", "export", *PLUG_INS)
+"""Pages that train a model, write all formats or install a package."""
 GIVEN = {
     "camera": """
 import numpy as np
@@ -159,7 +161,7 @@ for script in scripts:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(one, marks=[pytest.mark.trial] * (Path(one).name in PLUG_INS))  # they install a package
+        pytest.param(one, marks=[pytest.mark.trial] * (Path(one).name in LONG))
         for one in ("README", "docs/tutorial", *(f"docs/howto/{name}" for name in HOWTO))
     ],
 )

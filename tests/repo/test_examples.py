@@ -33,6 +33,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["median_flow_error_px"] < 0.2
 
 
+@pytest.mark.trial
 def test_a_dataset_with_custom_motion_camera_and_appearance(tmp_path: Path) -> None:
     dataset_recipe.main(tmp_path / "stirred", 1)
     assert verify_dataset(tmp_path / "stirred").good
@@ -73,6 +74,7 @@ def test_an_instrument_of_ones_own(tmp_path: Path) -> None:
     assert np.linalg.norm(scene.force, axis=1).max() > 0.5
 
 
+@pytest.mark.trial
 def test_a_block_of_liver_under_two_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["liver_block.py", str(tmp_path)])
     made = runpy.run_path(str(ROOT / "examples" / "liver_block.py"))

@@ -60,7 +60,7 @@ app(["predict", "press.npz", "--out", "out"], standalone_mode=False)
         "from bench.cli import app; app(['score', '--help'], standalone_mode=False)",
         "from bench.cli import app; app(['check', '.'], standalone_mode=False)",
         pytest.param(
-            "from synth.cli import app; app(['preview', 'tiny', '-o', 'a.png'], standalone_mode=False)",
+            "from synth.cli import app; app(['preview', 'tiny', '-n1', '-oa.png'], standalone_mode=False)",
             marks=pytest.mark.slow,
         ),
     ],

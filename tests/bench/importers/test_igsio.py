@@ -103,6 +103,7 @@ def test_six_numbers_of_force_with_pictures_of_which_some_are_invalid(tmp_path: 
     np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_recording_in_that_layout_is_scored_as_its_original(make: Maker, tmp_path: Path) -> None:
     original = make("original", frames=12)
     recording = open_recording(original)

@@ -51,8 +51,8 @@ def solve_directly(tissue: TissueKind, some: NDArray[np.intp]) -> Floats:
 def test_compliances_are_those_of_direct_solutions(coarse: None, tissue: TissueKind) -> None:
     some = np.arange(0, len(compliance.lattice().nodes), 25)
     direct = solve_directly(tissue, some)
-    for components in (2, 3):
-        matrix = compliance.solve(tissue, components)
+    for components, alone in ((2, False), (3, False), (3, True)):
+        matrix = compliance.solve(tissue, components, alone=alone)
         columns = matrix.reshape(len(matrix), 3, -1)[..., some].reshape(len(matrix), -1)
         # What surrounds the window is eliminated in single precision.
         np.testing.assert_allclose(columns, direct[: len(matrix)], atol=2e-6 * np.abs(direct).max(), rtol=0)
@@ -80,7 +80,9 @@ def test_a_basis_is_computed_once_and_again_if_its_file_is_cut_off(
     posterior.cache.folder.cache_clear()
     solved, tissue = [], TissueKind("bonded", 40.0, 0.45)
     solve = compliance.solve
-    monkeypatch.setattr(compliance, "solve", lambda *which: solved.append(which) or solve(*which))
+    monkeypatch.setattr(
+        compliance, "solve", lambda *which, **more: solved.append(which) or solve(*which, **more)
+    )
     first = posterior.load_basis(2, tissue)
     posterior.load_basis.cache_clear()
     again = posterior.load_basis(2, tissue)

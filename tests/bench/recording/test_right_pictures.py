@@ -109,7 +109,7 @@ def test_a_missing_right_or_depth_picture_is_a_gap(make: Make, second: str, lost
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("second", ["right", "depth"])
+@pytest.mark.parametrize("second", ["right", pytest.param("depth", marks=pytest.mark.trial)])
 def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, second: str) -> None:
     """The whole surface moves in depth, which one picture hardly shows, and is pressed meanwhile."""
     rate_hz, lift_mm, count = 0.4, 0.5, 72

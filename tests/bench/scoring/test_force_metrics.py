@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from sklearn.metrics import f1_score
 
 from bench import bootstrap
 from bench.scoring import force_metrics
@@ -73,6 +74,7 @@ def test_false_positives_are_counted_only_without_contact() -> None:
     scores, _ = force_metrics.compute_all(t, x, predicted)
     assert scores["false_positive_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
     assert force_metrics.compute_all(t, x, x)[0]["contact_f1"] == 1
+    assert scores["contact_f1"] == pytest.approx(f1_score(x > 50, predicted > 20))
 
 
 def autoregressive(n: int, phi: float, rng: np.random.Generator) -> np.ndarray:

@@ -50,6 +50,7 @@ def test_killed_and_resumed_equals_uninterrupted(clips: list[Clip], model: Path,
     assert card == checkpoint.read_card(model)
 
 
+@pytest.mark.slow
 def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The network overfits six sequences; without learning the loss stays at 0.9."""
     settings = small(epochs=8, batch=4, learning_rate=5e-3)

@@ -45,11 +45,11 @@ def test_processes_compile_once_for_a_version_and_a_target(
         compilation.compile_once({"SULCUS_THREADS": "7"}, 2, lines.append)
     assert sorted(log.read_text().splitlines()) == ["7 0 2", "7 1 2"]
     assert len(lines) == 1
-    monkeypatch.setattr("synth.system.jit.target", lambda: "another processor")
+    monkeypatch.setattr("synth.system.target_processor.target", lambda: "another processor")
     compilation.compile_once({}, 1, lines.append)
     assert len(lines) == 2
     script.write_text("#!/bin/sh\nexit 1\n")
-    monkeypatch.setattr("synth.system.jit.target", lambda: "a third")
+    monkeypatch.setattr("synth.system.target_processor.target", lambda: "a third")
     for _ in range(2):  # a failure is not taken for done
         compilation.compile_once({}, 1, lines.append)
     assert len(lines) == 4

@@ -54,6 +54,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_a_dataset_is_extended_by_any_number_of_workers(tmp_path: Path, undisturbed: str) -> None:
     root = tmp_path / "out"
     fewer = JOB.model_copy(update={"sequences": 2})
@@ -83,11 +84,11 @@ class InProcess:
         pass
 
 
-PARTED = JOB.model_copy(update={"sequences": 45})
+PARTED = JOB.model_copy(update={"sequences": 14})
 
 
-def test_forty_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight at a time, in an order of their own: stores, split and index are those of a single run."""
+def test_twelve_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four at a time, in an order of their own: stores, split and index are those of a single run."""
 
     @contextmanager
     def slots(kind: str, setup: Setup, *_: object) -> Iterator[list[InProcess]]:
@@ -95,14 +96,14 @@ def test_forty_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(engine, "_slots", slots)
     one = run(tmp_path / "one", job=PARTED)
-    order = np.random.default_rng(1).permutation(40) + 1
+    order = np.random.default_rng(1).permutation(12) + 1
 
     def part(number: int) -> Summary:
-        return run(tmp_path / "out", job=PARTED, part=Part(number, 40))
+        return run(tmp_path / "out", job=PARTED, part=Part(number, 12))
 
-    with ThreadPoolExecutor(8) as pool:
+    with ThreadPoolExecutor(4) as pool:
         made = list(pool.map(part, order.tolist()))
-    assert sum(summary.done for summary in made) == 45
+    assert sum(summary.done for summary in made) == 14
     assert {summary.total for summary in made} == {1, 2}
     assert one.content_hash in {summary.content_hash for summary in made}
     roots = tmp_path / "one", tmp_path / "out"
@@ -114,7 +115,7 @@ def test_forty_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: py
     assert run(tmp_path / "out", job=PARTED).content_hash == one.content_hash
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_killed_part_is_run_again_beside_another(tmp_path: Path, undisturbed: str) -> None:
     """Neither touches what the other computes; a run of the whole waits for none of them."""
     victim = start(tmp_path / "out", JOB, "stuck", "1/2")
@@ -243,7 +244,7 @@ def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) 
     assert sorted(tmp_path.rglob("*")) == sorted([*before, foreign, foreign / "thesis.txt"])
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("synth.system.file_lock._WAIT_S", 0.3)
     first = start(tmp_path / "out", JOB, "slow")
@@ -256,7 +257,7 @@ def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert first.returncode == 0
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 @pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
 def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: int, undisturbed: str) -> None:
@@ -273,7 +274,7 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: int, undist
     assert not list((tmp_path / "out").glob("*.part"))
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_status_during_and_after_a_run(tmp_path: Path) -> None:
     root = tmp_path / "out"
     other = start(root, JOB, "slow")

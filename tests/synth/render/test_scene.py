@@ -102,7 +102,7 @@ def test_few_paths_have_the_mean_of_many() -> None:
 def test_tissue_is_visible_through_the_opening_only() -> None:
     """The wound's floor lies lower than the dura in front of it, and over the brain."""
     for seed in range(3):
-        job = Job(seed=seed, anatomy=AnatomySection(vertices=6000), render={"size": (320, 240)})
+        job = Job(seed=seed, anatomy=AnatomySection(vertices=6000), render={"size": (192, 144)})
         scene = at_rest(job)
         rest, drawn = scene.renderer.rest, scene.scenario.appearance
         edge = rim.build(scene.surface, job.anatomy.craniotomy.radius_mm, drawn, scene.view.mm_per_px).edge

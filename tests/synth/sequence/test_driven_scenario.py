@@ -95,6 +95,7 @@ def test_a_draw_that_fails_is_drawn_anew_and_counted(monkeypatch: pytest.MonkeyP
     assert case.gestures != draw_scenario(job(travel_mm=0.5), 1).gestures
 
 
+@pytest.mark.slow
 def test_the_label_adds_up_to_the_reaction_in_the_picture() -> None:
     given = {"gesture": "retract", "instrument": "spatula", "place": [0, 0], "travel_mm": 3}
     given |= {"footprint_mm": 4, "direction": [1, 0, -0.2]}

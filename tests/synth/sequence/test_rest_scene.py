@@ -44,6 +44,7 @@ def test_labels_without_a_meaning_are_refused(tmp_path: Path, changes: list[str]
         synth.write_scene(synth.simulate(synth.load_job("tiny", [*small, *changes])), tmp_path)
 
 
+@pytest.mark.slow
 def test_it_is_the_scene_in_a_dataset(
     scene: synth.Scene, job: synth.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

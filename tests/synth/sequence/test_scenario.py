@@ -76,6 +76,7 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> Job:
     )
 
 
+@pytest.mark.slow
 def test_a_load_that_the_mesh_does_not_bear_is_drawn_anew_alike_each_time(brittle: Job) -> None:
     cases = [simulate(brittle, index).scenario for index in range(4)]
     assert 0 < sum(case.attempt > 0 for case in cases) < 4

@@ -62,7 +62,7 @@ def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp
 @pytest.mark.slow
 def test_flow_is_the_projection_of_the_engines_nodes(source: Path) -> None:
     """Of a fine mesh, between whose nodes motion is smooth; without veins, which would stand out of it."""
-    fine = ["anatomy.vertices=160000", "render.size=[320,240]", "flow.backend=ideal"]
+    fine = ["anatomy.vertices=90000", "render.size=[240,180]", "flow.backend=ideal"]
     folder = write(source.parent / "fine", "npz", spacing_mm=1.5)
     scene = synth.simulate(job_of(folder, *FORCE, *fine), 0, content=draw_craniotomy)
     block, t, frame = solve(1.5), 2, scene.frame(2)

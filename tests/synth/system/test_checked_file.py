@@ -80,6 +80,7 @@ def npz(path: Path, shape: tuple[int, ...], size: int, method: int = zipfile.ZIP
             entry.write(bytes(min(1 << 20, size - start)))
 
 
+@pytest.mark.slow
 def test_an_array_is_expanded_when_it_is_needed_and_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
