@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from dome import patch
+from driven_gesture import gesture
 
 from synth.fem import driven_contact, surface_embedding
 from synth.fem.deformation import Deformation
@@ -20,42 +21,13 @@ from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, TimeScheme
 from synth.fem.pulse import Pulse
 from synth.fem.solver import deform
-from synth.fem.tool_gesture import Drive, Gesture, ToolContact, grip, trajectory
+from synth.fem.tool_gesture import Gesture, ToolContact, trajectory
 from synth.geometry.triangles import Shape
 
 FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())
 DOWN, ASIDE, UP = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 TISSUE = Tissue(2.0, 0.45, "ogden", alpha=-8.0)
 RELAXING = ((0.45, 0.5), (0.3, 5.0))
-
-
-def gesture(
-    kind: str = "push",
-    direction: tuple[float, float, float] = DOWN,
-    travel: float | None = 2.0,
-    force: float | None = None,
-    size: tuple[float, float] = (8.0, 8.0),
-) -> Gesture:
-    spread, closing = (6.0, 1.0) if kind == "grasp" else (1.0, 0.0)
-    places, _ = grip(kind, np.zeros(2), np.array(direction), spread, 0.0)
-    return Gesture(
-        kind=kind,
-        instrument="forceps" if kind == "grasp" else "dissector",
-        contacts=tuple(ToolContact((float(x), float(y)), (0.0, 0.0, 0.0)) for x, y in places),
-        footprint_mm=0.5 * float(np.sqrt(size[0] * size[1])),
-        load=0.0,
-        point_mm=(0.0, 0.0),
-        direction=direction,
-        force_mn=force or 0.0,
-        path_mm=(0.0, 0.0),
-        azimuth_deg=0.0,
-        elevation_deg=50.0,
-        spread_mm=spread,
-        hover_mm=8.0,
-        taps=1,
-        timing=(0.1, 0.4, 0.6, 0.9),
-        drive=Drive(travel, force, closing, size),
-    )
 
 
 def run(
