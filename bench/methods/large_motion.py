@@ -7,7 +7,12 @@ point of the surface to the place d_p where it was seen,
 
 W the energy of a block under Ogden's law; the springs' ends are then moved on by what tissue lags. The pull
 of those at the contact, where tissue moves by a quarter of the largest motion, is the force: neither its
-place nor its form has to be found, and what holds the tissue's edge hardly matters, as its motion is seen.
+place nor its form has to be found, and where the tissue's edge is seen, what holds it hardly matters.
+
+Where it is not seen, it lies between what is seen and far away. An opening that is too small resists the
+motion at the picture's border, one that is too wide lets go of it: springs beside the contact then pull with
+it or against it, by up to the force itself. Of the two extremes that mixture is the answer of which these
+springs pull nothing: beside the instrument nothing pulls.
 """
 
 from __future__ import annotations
@@ -19,7 +24,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.ndimage import gaussian_filter
 
-from bench.methods.compliance import DOME_MM, TO_CAMERA, Edge, TissueKind
+from bench.methods.compliance import DOME_MM, TO_CAMERA, TissueKind
 from learn.data.grid import Grid
 from synth.arrays import Floats, Map
 from synth.fem import surface_embedding
@@ -40,6 +45,7 @@ _FIRST, _SHORTEST = 0.5, 0.05  # steps of the imposed motion, as parts of it
 _MOVED = 0.25  # part of the largest motion that a point has whose springs' pull counts
 _REFINEMENTS = 1
 _LEAST_MM = 0.02  # lower limit of a deviation
+_WHOLE = 0.9  # least radius of what is seen, in openings, whose mesh is fine under the whole opening
 OPEN_MM = 40.0  # opening of a block without a skull near
 _SMOOTH_MM = 0.5, 1.5  # least and largest standard deviation of the means over neighbours
 _PER_MM = 10.0  # that deviation over that of the motion
@@ -80,13 +86,33 @@ def seen_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion
     return SeenMotion(points, mean[:, inside].T, grid.pitch_mm**2, float(steep))
 
 
-def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float, alpha: float) -> Floats:
+def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float | None, alpha: float) -> Floats:
     """Force (3,) mN for E = 1 kPa, camera axes, that moves the surface so.
 
-    `opening_mm`: radius of the opening, unless the tissue's edge is free; `alpha`: exponent of Ogden's law.
-    Raises ExcessiveLoad: no equilibrium is found, or elements turn inside out.
+    `opening_mm`: radius of the opening; None: its edge is not seen; `alpha`: exponent of Ogden's law. Raises
+    ExcessiveLoad: no equilibrium is found, or elements turn inside out.
     """
-    volume, embedding = _block(tissue.edge, round(opening_mm, 1), len(motion.points), motion.points.tobytes())
+    seen_mm = float(np.sqrt(len(motion.points) * motion.area_mm2 / np.pi))
+    if opening_mm is not None:
+        whole = seen_mm > _WHOLE * opening_mm
+        return _pull(motion, tissue, opening_mm, None if whole else seen_mm, alpha)[0]
+    least = float(np.linalg.norm(motion.points, axis=1).max())  # the skull covers no tissue that is seen
+    near, wide = (_pull(motion, tissue, radius, seen_mm, alpha) for radius in (least, max(OPEN_MM, least)))
+    # Pulls beside the contact along the force, and the part of the wide opening at which they vanish.
+    excess, lack = (float(beside @ force) / float(force @ force) for force, beside in (near, wide))
+    part = 0.5 if excess == lack else float(np.clip(excess / (excess - lack), 0, 1))
+    return (1 - part) * near[0] + part * wide[0]
+
+
+def _pull(
+    motion: SeenMotion, tissue: TissueKind, opening_mm: float, focus_mm: float | None, alpha: float
+) -> tuple[Floats, Floats]:
+    """Pulls (3,) mN for E = 1 kPa, camera axes, of the springs at the contact and of those beside it.
+
+    `focus_mm`: radius in which the mesh is fine; None: all of the opening.
+    """
+    radii = round(opening_mm, 1), None if focus_mm is None else round(focus_mm, 1)
+    volume, embedding = _block(tissue.edge == "slipping", *radii, len(motion.points), motion.points.tobytes())
     sheet = MembraneSheet(tissue.membrane, max(tissue.stretch, _LEAST_STRETCH)) if tissue.membrane else None
     system = assemble(volume, "ogden", tissue.poisson, sheet, alpha)
     value, size = embedding.value, np.linalg.norm(motion.moved, axis=1)
@@ -110,19 +136,20 @@ def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float, alpha: f
     for _ in range(_REFINEMENTS):  # the springs' ends are moved on by as much as the tissue lags
         wanted = wanted + seen - value @ u
         u, _, energy, _ = balance.find(firm * (value.T @ wanted), u, u, energy, _LEAST_JACOBIAN)
-    traction = firm * (wanted - value @ u)
-    return np.asarray(TO_CAMERA @ traction[size >= _MOVED * size.max()].sum(axis=0))
+    traction, contact = firm * (wanted - value @ u), size >= _MOVED * size.max()
+    return TO_CAMERA @ traction[contact].sum(axis=0), TO_CAMERA @ traction[~contact].sum(axis=0)
 
 
 _LEAST_STRETCH = 1.001  # of a membrane at rest: a slack one has no stiffness across
 
 
 @lru_cache(maxsize=4)
-def _block(edge: Edge, opening_mm: float, count: int, points: bytes) -> tuple[Tets, Embedding]:
+def _block(
+    slips: bool, opening_mm: float, focus_mm: float | None, count: int, points: bytes
+) -> tuple[Tets, Embedding]:
     """The block and the embedding of points (P, 2) mm in its surface."""
-    radius = OPEN_MM if edge == "free" else opening_mm
-    focus = [(0.0, 0.0, opening_mm)] if edge == "free" else []
-    volume = tetrahedra.block(_TETS, focus, opening_mm=radius, dome_mm=DOME_MM, slips=edge == "slipping")
+    focus = [] if focus_mm is None else [(0.0, 0.0, focus_mm)]
+    volume = tetrahedra.block(_TETS, focus, opening_mm=opening_mm, dome_mm=DOME_MM, slips=slips)
     world = np.frombuffer(points).reshape(count, 2) * [1.0, -1.0]
     places = np.column_stack([world, tetrahedra.dome(world, DOME_MM)])
     return volume, surface_embedding.embed(volume, places)

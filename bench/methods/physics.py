@@ -353,15 +353,14 @@ def find_gains(
 ) -> Gains:
     """Gains of frames with large motion, of rising slope, on the likeliest tissue; few of them are solved."""
     tissue, radius = weights.tissues[0], np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
-    if tissue.edge == "free" and touches_border(scene.tissue) <= TISSUES.cut:
-        tissue = replace(tissue, edge="bonded")  # a wide opening, seen whole
+    seen = touches_border(scene.tissue) <= TISSUES.cut
+    opening_mm = min(float(radius), large_motion.OPEN_MM) if seen else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
     for frame, motion in large[::-2][: TISSUES.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))
         if size == 0:
             continue
         ends = TISSUES.unsolved
-        opening_mm = min(float(radius), large_motion.OPEN_MM)
         try:
             forces = [
                 large_motion.reaction(motion, tissue, opening_mm, alpha) for alpha in sorted(set(scene.alpha))

@@ -21,6 +21,7 @@ class Pia:
     young_kpa: float  # Young's modulus at small strain
     thickness_mm: float
     stretch: float  # pre-stretch, at rest
+    stiffening: float = 0.0  # as of `MembraneSheet`
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Tissue:
         """The equations of a volume of this tissue."""
         pia, sheet = self.membrane, None
         if pia is not None:
-            sheet = MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
+            stiffness = pia.young_kpa * pia.thickness_mm / self.young_kpa
+            sheet = MembraneSheet(stiffness, pia.stretch, pia.stiffening)
         given = self.law, self.poisson, sheet, self.alpha
         return _SYSTEMS.get(lambda: assemble(tets, *given), tets, given)

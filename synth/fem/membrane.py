@@ -9,6 +9,13 @@ at small strain S/3 (e:e + (tr e)^2). A sheet so thin wrinkles rather than bear 
 relaxed energy (Pipkin, IMA J. Appl. Math. 36, 1986): where the smaller principal stretch falls below that of
 uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0 where that is below 1.
 
+Collagen that is wavy at rest stiffens as it straightens: with X the bracket above, S/6 X becomes
+
+    W = S/(6 b) (exp(b X) - 1)    (Demiray, J. Biomech. 5, 1972, of Fung's kind),
+
+which wrinkles where the sheet of b = 0 does, as it rises with X. A strip then bears S/3 (l - 1/l^2) exp(b X)
+at a stretch l: at b = 30 it is five times as stiff at a strain of 0.1 as at rest.
+
 At rest it is pre-stretched, as in a living head; the pressure inside balances that as a constant load.
 Measured: without pre-stretch the sheet is slack one way and stiff the other, and the solver takes several
 times as long; a sheet that resists compression buckles.
@@ -29,6 +36,8 @@ from synth.system.jit import compiled, inlined
 _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 """Barycentric quadrature points of degree 2, of equal weight: exact at small strain for flat faces."""
 
+_LARGEST_POWER = 300.0  # of exp: beyond it an energy would overflow
+
 
 @dataclass(frozen=True)
 class MembraneSheet:
@@ -36,6 +45,7 @@ class MembraneSheet:
 
     stiffness: float  # mN/mm: thickness times Young's modulus
     stretch: float  # pre-stretch at rest, the same in every direction; above 1
+    stiffening: float = 0.0  # b of its energy; 0: neo-Hookean
 
 
 @dataclass(frozen=True)
@@ -49,21 +59,33 @@ class Membrane:
     stiffness: float  # mN/mm: thickness times Young's modulus
     linear: bool  # small strain, with resistance to compression: goes with a volume of the linear law
     square: float  # squared stretch at rest
+    stiffening: float  # b of its energy
     balance: Floats  # (N, 3) mN: its force at rest, which the pressure inside balances
     stored: float  # mN mm, its energy at rest
 
     def pull(self, u: Floats, out: Floats) -> float:
         """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm; both are 0 at rest."""
         mesh = self.faces, self.slope, self.tangent, self.weight
-        energy = float(_pull(*mesh, u, self.stiffness, self.linear, self.square, out))
+        energy = float(_pull(*mesh, u, self.stiffness, self.linear, self.square, self.stiffening, out))
         out -= self.balance
         return energy - self.stored - float(np.vdot(self.balance, u))
 
     def rest_stiffness(self) -> sp.csr_array:
         """(3N, 3N) mN/mm at rest, exact; being stretched, it has no wrinkles."""
-        place = self.tangent
-        stress, moduli = _moduli(self.square * np.einsum("fqia,fqib->fqab", place, place), self.stiffness)
-        stress, moduli = self.square * stress, self.square**2 * moduli
+        return self._stiffness(self.tangent)
+
+    def stiffness_at(self, u: Floats) -> sp.csr_array:
+        """(3N, 3N) mN/mm at (N, 3) mm, positive semi-definite: exact but where it begins to wrinkle."""
+        return self._stiffness(self.tangent + np.einsum("fqna,fni->fqia", self.slope, u[self.faces]))
+
+    def _stiffness(self, place: Floats) -> sp.csr_array:
+        """At tangents (F, Q, 3, 2) that the sheet has moved."""
+        metric = self.square * np.einsum("fqia,fqib->fqab", place, place)
+        if self.linear:
+            stress, moduli = _taut(metric)
+        else:
+            stress, moduli = _relaxed(metric, self.stiffening)
+        stress, moduli = self.stiffness * self.square * stress, self.stiffness * self.square**2 * moduli
         bent = np.einsum("fqna,fqib->fqniab", self.slope, place)
         local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
         held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
@@ -98,6 +120,7 @@ def lay(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
         sheet.stiffness,
         linear,
         1.0 if linear else sheet.stretch**2,
+        sheet.stiffening,
         np.zeros_like(tets.points),
         0.0,
     )
@@ -113,6 +136,7 @@ def _pull(
     stiffness: float,
     linear: bool,
     square: float,
+    stiffening: float,
     out: Floats,
 ) -> float:
     """Adds the forces of the whole sheet, stretch at rest included, and returns its energy."""
@@ -148,7 +172,11 @@ def _pull(
                     yy += bent[i, 1] * bent[i, 1]
                     xy += bent[i, 0] * bent[i, 1]
                 density, sxx, syy, sxy = _stretch(square * xx, square * yy, square * xy)
-                sxx, syy, sxy = square * sxx, square * syy, square * sxy
+                growth = square
+                if stiffening > 0:
+                    power = np.exp(min(6 * stiffening * density, _LARGEST_POWER))
+                    density, growth = (power - 1) / (6 * stiffening), square * power
+                sxx, syy, sxy = growth * sxx, growth * syy, growth * sxy
             w = weight[f, q] * stiffness
             energy += w * density
             for n in range(nodes):
@@ -177,11 +205,40 @@ def _stretch(xx: float, yy: float, xy: float) -> tuple[float, float, float, floa
     return energy, (1 - yy * over) / 3, (1 - xx * over) / 3, xy * over / 3
 
 
-def _moduli(metric: Floats, stiffness: float) -> tuple[Floats, Floats]:
-    """Second Piola-Kirchhoff stress (..., 2, 2) and its derivative by strain, without wrinkles."""
+def _taut(metric: Floats) -> tuple[Floats, Floats]:
+    """Second Piola-Kirchhoff stress (..., 2, 2) and its derivative by strain at the metric C, for S = 1, of a
+    neo-Hookean sheet without wrinkles."""
     inverse, det = np.linalg.inv(metric), np.linalg.det(metric)[..., None, None]
-    stress = stiffness / 3 * (np.eye(2) - inverse / det)
+    stress = (np.eye(2) - inverse / det) / 3
     crossed = np.einsum("...ac,...bd->...abcd", inverse, inverse)
     crossed = 0.5 * (crossed + np.swapaxes(crossed, -1, -2))
     whole = np.einsum("...ab,...cd->...abcd", inverse, inverse) + crossed
-    return stress, 2 * stiffness / 3 * whole / det[..., None, None]
+    return stress, 2 / 3 * whole / det[..., None, None]
+
+
+def _relaxed(metric: Floats, stiffening: float) -> tuple[Floats, Floats]:
+    """As `_taut`, of a sheet that stiffens and wrinkles."""
+    size, way = np.linalg.eigh(metric)
+    small, large = size[..., 0], np.maximum(size[..., 1], 1.0)  # below 1 it is slack: 0, as at 1
+    stress, moduli = _taut(metric)
+    excess = np.trace(metric, axis1=-2, axis2=-1) + 1 / (small * size[..., 1]) - 3
+    along, across = way[..., 1], way[..., 0]
+    line = along[..., :, None] * along[..., None, :]
+    turn = along[..., :, None] * across[..., None, :]
+    turn = turn + np.swapaxes(turn, -1, -2)
+    pull = (1 - large**-1.5) / 3  # of a strip
+    curve = np.where(size[..., 1] > 1, large**-2.5, 0.0)
+    gap = np.maximum(size[..., 1] - small, 1e-12)  # where it wrinkles, the stretches differ
+    folded = curve[..., None, None, None, None] * np.einsum("...ab,...cd->...abcd", line, line)
+    folded = folded + (pull / gap)[..., None, None, None, None] * np.einsum(
+        "...ab,...cd->...abcd", turn, turn
+    )
+    wrinkled = small * size[..., 1] < np.sqrt(large)
+    stress = np.where(wrinkled[..., None, None], pull[..., None, None] * line, stress)
+    moduli = np.where(wrinkled[..., None, None, None, None], folded, moduli)
+    if stiffening > 0:
+        excess = np.where(wrinkled, large + 2 / np.sqrt(large) - 3, excess)
+        power = np.exp(np.minimum(stiffening * excess, _LARGEST_POWER))[..., None, None]
+        moduli = moduli + 6 * stiffening * np.einsum("...ab,...cd->...abcd", stress, stress)
+        stress, moduli = power * stress, power[..., None, None] * moduli
+    return stress, moduli

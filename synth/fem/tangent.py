@@ -43,7 +43,7 @@ def linearise(system: System, u: Floats) -> System:
     if system.slip is not None:
         whole = whole + system.slip
     if system.membrane is not None:
-        whole = whole + system.membrane.rest_stiffness()
+        whole = whole + system.membrane.stiffness_at(u)
     whole = sp.csr_array(whole)
     return replace(system, stiffness=whole, factor=factorise(whole, system.free))
 

@@ -1,16 +1,22 @@
-"""Forces of tenths of a newton from exact motion that felupe computed."""
+"""Forces of tenths of a newton from exact motion: felupe's, and our own in wide openings."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from dome import patch
+from driven_gesture import gesture
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from bench.methods import large_motion, physics
-from bench.methods.compliance import TissueKind
+from bench.methods.compliance import DOME_MM, TissueKind
 from bench.methods.method_interface import FrameMotion, MethodContext
+from synth.fem.material import Tissue
+from synth.fem.mesh import tetrahedra
+from synth.fem.motion import TimeScheme
+from synth.fem.solver import deform
 from synth.flow.stereo.stereo_track import Moved
 
 FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())["openings"]
@@ -40,6 +46,24 @@ def test_the_force_behind_felupes_motion_is_found(scene: dict) -> None:  # type:
     tissue = TissueKind("bonded", 0.0, scene["poisson"])
     answer = large_motion.reaction(seen, tissue, OPENING_MM, scene["alpha"])
     assert np.linalg.norm(answer - force) <= 0.12 * np.linalg.norm(force)
+
+
+@pytest.mark.parametrize("opening_mm", [18.0, pytest.param(25.0, marks=pytest.mark.slow)])
+def test_the_force_is_found_where_the_picture_cuts_a_wide_opening(opening_mm: float) -> None:
+    way = np.array([1.0, 0.2, -0.15])
+    pull = gesture("retract", tuple(way / np.linalg.norm(way)), 4.5, size=(14.0, 9.0), place=(-3.0, 0.0))
+    tissue, surface = Tissue(1.0, 0.45, "ogden", alpha=-8.0), patch(61, 46.0)
+    tets = tetrahedra.block(700, list(pull.focus), opening_mm=opening_mm, dome_mm=DOME_MM)
+    motion = deform(TimeScheme(), tissue, [pull], tets, surface, 3, 5.0)
+    force, grid = motion.force[1] * [1, -1, -1], physics.GRID
+    axis = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
+    x, y = np.meshgrid(axis, axis)
+    along = CloughTocher2DInterpolator(surface.vertices[:, :2], motion.displacement[1])
+    moved = np.moveaxis(along(np.stack([x, -y], axis=-1)) * [1, -1, -1], -1, 0)
+    shown = (np.maximum(np.abs(x), np.abs(y)) < 13) & (np.hypot(x, y) < opening_mm)
+    seen = large_motion.seen_motion(moved, np.full(moved.shape, 0.01), shown, grid)
+    answer = large_motion.reaction(seen, TissueKind("bonded", 0.0, 0.45), None, -8.0)
+    assert np.linalg.norm(answer - force) <= 0.1 * np.linalg.norm(force)
 
 
 @pytest.mark.slow

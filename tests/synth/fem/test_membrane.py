@@ -65,6 +65,45 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
     assert pulled(sheet, flat.points @ turn.T - flat.points)[0] / area < 1e-12
 
 
+@pytest.mark.parametrize("stiffening", [0.0, 20.0])
+def test_stiffness_at_large_strain_is_the_slope_of_force(tets: Tets, stiffening: float) -> None:
+    sheet = cover(tets, MembraneSheet(20.0, 1.03, stiffening), linear=False)
+    rng, h = np.random.default_rng(0), 1e-7
+    u, way = rng.normal(0, 0.15, tets.points.shape), rng.normal(size=tets.points.shape)
+    more, less = pulled(sheet, u + h * way), pulled(sheet, u - h * way)
+    assert float(np.vdot(pulled(sheet, u)[1], way)) == pytest.approx((more[0] - less[0]) / (2 * h), rel=1e-5)
+    slope = (more[1] - less[1]) / (2 * h)
+    found = (sheet.stiffness_at(u) @ way.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(found, slope, atol=1e-5 * np.abs(slope).max())
+    at_rest = (sheet.stiffness_at(0 * u) - sheet.rest_stiffness()).toarray()
+    assert not at_rest.any()
+    whole = sheet.stiffness_at(u).toarray()
+    assert np.linalg.eigvalsh(whole).min() >= -1e-9 * np.abs(whole).max()
+
+
+def test_a_strip_and_a_balloon_stiffen_as_in_closed_form() -> None:
+    """W = S/(6 b) (exp(b X) - 1); X is l^2 + 2/l - 3 of a strip, 2 l^2 + 1/l^4 - 3 of a balloon's wall."""
+    flat, b, h = tetrahedra.block(250, dome_mm=1e9), 30.0, 1e-6
+    sheet = cover(flat, MembraneSheet(3.0, 1.0, b), linear=False)
+    area, at = float(sheet.weight.sum()), flat.points * [1.0, 1.0, 0.0]
+
+    def tension(stretch: float, way: list[float]) -> float:
+        """mN/mm: slope of the energy by the stretch."""
+        up, down = (
+            pulled(sheet, (stretch - 1 + side * h) * at * way + at * [0, free, 0])[0] for side in (1, -1)
+        )
+        return (up - down) / (2 * h * area)
+
+    for stretch in (1.001, 1.1, 1.2):
+        free = -0.4  # aside it wrinkles
+        power = np.exp(b * (stretch**2 + 2 / stretch - 3))
+        assert tension(stretch, [1, 0, 0]) == pytest.approx((stretch - stretch**-2) * power, rel=1e-5)
+        free = 0.0
+        power = np.exp(b * (2 * stretch**2 + stretch**-4 - 3))
+        assert tension(stretch, [1, 1, 0]) == pytest.approx(2 * (stretch - stretch**-5) * power, rel=1e-5)
+    assert abs(pulled(sheet, -0.1 * at)[0]) < 1e-12  # slack
+
+
 @pytest.mark.slow
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The instruments' work while loading equals the stored energy, and comes back in unloading."""
