@@ -336,9 +336,10 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
     aside = _aside(angle, rim.stitches.astype(np.float32)[stitch])
     folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
-    crease = away - _round(rim.crease, angle) - 0.12 * mottle
+    start = _round(rim.crease, angle)
+    crease = away - start - 0.12 * mottle
     inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
-    turned = np.clip(_round(rim.crease, angle) - 0.5, 0, 1)
+    turned = np.clip(start - 0.5, 0, 1)
     soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * inner)
     deepest, level = Blood.pool
     full = spilt + 0.06 * mottle + level * (3 * appearance.blood - 3.1) - 0.8 * inner

@@ -107,6 +107,7 @@ class Film:
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
+    reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.17  # standard deviation of slopes where the film is thin
     level: float = 0.9  # share of the pia's slope that a pool takes away
@@ -137,7 +138,11 @@ def cortex(
     rng = np.random.default_rng([surface.seed, 2])
     grown = surface.vessels
     drawn = {"veins": grown.visible_veins, "arteries": grown.arteries, "deep": grown.deep}
-    tubes = {name: tube.raster(tree, pixels, extent) for name, tree in drawn.items()}
+    # Fluid climbs along veins and arteries, along fine ones less far.
+    finest, wide = Film.reach_mm
+    margins = {name: np.clip(finest + tree.radius / 0.3, finest, wide) for name, tree in drawn.items()}
+    margins["deep"] = np.full(len(grown.deep.radius), extent / pixels)
+    tubes = {name: tube.raster(tree, pixels, extent, margins[name]) for name, tree in drawn.items()}
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
@@ -348,7 +353,7 @@ def _film(
     fine = np.tile(tile, (len(sulci) // _TILE + 1,) * 2)[: len(sulci), : len(sulci)]
     height = height + (Film.rough * extent / len(sulci)) * rough * fine
     start, span = Vein.wide
-    wide = noise.blur(np.clip((radius - start) / span, 0, 1) * (distance < radius), 0.1, extent)
+    wide = on_vein * np.clip((radius - start) / span, 0, 1)
     height = height + wide * _waves(tile, extent, len(sulci))
     bare, wide = (
         cv2.resize(share, (coarse, coarse), interpolation=cv2.INTER_AREA) for share in (on_vein, wide)
