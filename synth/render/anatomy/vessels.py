@@ -178,14 +178,16 @@ def _led_in(tree: Tree, hidden: Mask, extent_mm: float, rng: np.random.Generator
         ahead /= max(float(np.linalg.norm(ahead)), 0.2)
         goals = np.concatenate([screens, tree.nodes[(trunk != root) & (tree.radius > wide)]])
         away = np.hypot(*(goals - start).T)
-        if away.min() < _BEHIND_MM:
+        if away.min() < _BEHIND_MM:  # it comes up there
+            risen = 0.15 + np.hypot(*(tree.nodes[around] - start).T) / (0.5 * _RISE_MM)
+            tree.radius[around] *= np.clip(risen, 0, 1)
             continue
         nearest = np.argmin(away * (1.4 + (goals - start) @ ahead / away))
         long, goal = float(away[nearest]), goals[nearest]
         part = np.linspace(0, 1, max(4, round(long / _LED_MM)))[:-1, None]
         bend = start - 0.45 * long * ahead + rng.normal(0, 0.08 * long, 2)
         paths.append((1 - part) ** 2 * goal + 2 * part * (1 - part) * bend + part**2 * start)
-        radii.append(wide * np.clip(0.05 + part[:, 0] * long / _RISE_MM, 0, 1) ** 0.7)
+        radii.append(wide * np.clip(0.05 + part[:, 0] * max(1, long / _RISE_MM), 0, 1) ** 0.7)
         ends.append(int(root))
     sizes = np.array([len(path) for path in paths], np.int64)
     count = int(sizes.sum())
