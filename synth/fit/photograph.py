@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image, JpegImagePlugin
 
-from synth.arrays import Mask, Pixels
+from synth.arrays import Floats, Mask, Pixels
 from synth.errors import UserError
 from synth.flow.segmentation import segment
 from synth.job.schema import RenderSection
@@ -23,6 +23,7 @@ _BITRATES = (0.25, 0.5, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.
 _SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 _BANDS_PX = ((0.7, 1.4), (2.8, 5.6))
 _BLOCK, _SMOOTHEST = 16, 0.2  # px; noise is measured where such blocks are smoothest
+_OFF, _FITS = 0.3, 5  # of the logarithm of red light, beyond which a pixel is no plain tissue; rounds
 _GROWN_PX = 2, 4  # around highlights, for colour and for sharpness
 _CLIPPED = 240.0  # grey levels: two channels above it have no texture left
 _ABOVE = 45.0  # grey levels of a highlight above the local median
@@ -119,9 +120,10 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     """Statistics by which a photograph can be compared with a rendered frame of another cortex.
 
     `vignette`: logarithmic loss of red light, which blood hardly absorbs, in the corners, less a slope due to
-    lamps at one side. `noise`: standard deviation in grey levels where tissue is smoothest (J. Immerkaer,
-    1996). `sharpness`: contrast of the finest octave relative to two octaves coarser, without noise. `rgb`:
-    (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the photograph's.
+    lamps at one side, of tissue between vessels. `noise`: standard deviation in grey levels where tissue is
+    smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave relative to two octaves
+    coarser, without noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the
+    photograph's.
     """
     wet = find_highlights(rgb).astype(np.uint8)
     tissue, clear = (usable & (cv2.dilate(wet, np.ones((2 * by + 1,) * 2)) == 0) for by in _GROWN_PX)
@@ -139,9 +141,20 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     away = reach**2 * ((at - middle) ** 2).sum(axis=1) / (middle**2).sum()
     red = rgb[tissue, 0] / np.median(rgb[tissue, 0])
     light = np.log(np.maximum(red**2.2, 0.5))
-    slopes, *_ = np.linalg.lstsq(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
+    slopes = _fit_without_outliers(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
     sharpness = float(np.sqrt(energy[0] / energy[1]))
     return {"noise": float(noise), "sharpness": sharpness, "vignette": -float(slopes[0])}
+
+
+def _fit_without_outliers(terms: Floats, values: Floats) -> Floats:
+    """Least-squares coefficients (n,) of terms (N, n), without values (N,) that are off by `_OFF`: vessels
+    and clefts, which lie elsewhere in every cortex."""
+    near = np.ones(len(values), bool)
+    for _ in range(_FITS):
+        slopes, *_ = np.linalg.lstsq(terms[near], values[near])
+        off = values - terms @ slopes
+        near = np.abs(off - np.median(off[near])) < _OFF
+    return np.asarray(slopes)
 
 
 def find_highlights(rgb: Pixels) -> Mask:

@@ -67,10 +67,13 @@ def craniotomy(
         min(texture.resolution(extent, one), _MOST_TEXELS if how.scale != 1 else 4096)
         for extent, one in ((patch.chart.extent_mm, px_mm), (around.extent_mm, 2.2 * px_mm))
     )
+    lamps = light.lamps(camera, appearance.light)
     if how.pattern is None:
+        x, y, rise = light.mirror_slopes(camera, lamps[0])
+        mirror = x, y, rise * how.scale
         shade = rim.shade(around, patch) if how.surroundings is None else None
-        paint = partial(texture.cortex, patch, appearance, pixels, photo, shade)
-        coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade)
+        paint = partial(texture.cortex, patch, appearance, pixels, photo, shade, mirror)
+        coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade, mirror)
         wet = appearance.roughness, appearance.dry_roughness
         if how.tinted:
             coat = replace(coat, albedo=pattern.tinted(coat.albedo, how.tint, how.tinted))
@@ -83,7 +86,6 @@ def craniotomy(
     painted = partial(_COATS.get, paint_rim, around, appearance, texels)
     rim_coat = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
     static = [Body(how.scale * around.shape.vertices, around.shape.faces, around.uv, rim_coat)]
-    lamps = light.lamps(camera, appearance.light)
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
     if how.surroundings is not None:

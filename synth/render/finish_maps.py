@@ -6,6 +6,8 @@ so that no seam is in view. Columns run along the part, rows across it. Depths a
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
 
@@ -16,16 +18,24 @@ from synth.render.idle import CLOTH
 from synth.render.materials import FinishMaps
 
 RING = 32  # vertices of each of a closed bar's rings
-_ACROSS = 24, 112  # rows of texels, least and most
+_ACROSS = 24, 224  # rows of texels, least and most
+_MOST_ALONG = 640  # columns of a bar's
 _WIDE_MM = 5.0  # of a usual part's shown half, by which the texels are as large as the picture's pixels
 _PLASTIC = np.full(3, 0.04, np.float32)  # reflectance at right angles, at an index of 1.5
 _BLOOD = np.array([0.20, 0.006, 0.005], np.float32)  # albedo of a clot
 _FILM = 0.45, 3.2, 3.6  # absorption of a film of blood, passed twice
 _LEAST = 0.1  # of the roughness across by that along
-_WARP = 0.02  # height of a blade's unevenness
+_WARP = 0.03  # height of a blade's unevenness
+_HOLLOW = 0.2  # depth of a blade's hollow, as a share of half its width
+_BLOOD_MM = 0.025  # height of a film of blood
+_LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
 _SERRATION_MM = 0.5, 5.5, 0.38  # of forceps' inner faces: start, end, and period along the tip
 _BORE_RINGS = 5.2  # rings of a tube that are inside
+_DROPS = 1.2  # mean number of drops of water, per mm under water
+_DROPS_MM = 8.0  # from the tip to where they end
+_DROP_MM = 0.12, 0.6  # their radii,
+_FLAT = 0.2  # and height as a share of it: water spreads on steel
 _MARKS_MM = 6.0, 1.1, 0.14  # etched rings: their distance from each other, that of a pair, width
 
 
@@ -52,6 +62,39 @@ def wrap(points: Floats, outline: Floats) -> Map:
     return np.column_stack([along, 0.5 - np.arctan2(y, np.abs(x)) / np.pi]).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class _Texels:
+    """Where the texels (h, w) of a part are, and the noise on them, of unit variance."""
+
+    kind: str
+    sheet: bool
+    place: Map  # (h, w, 3) mm
+    along: Map  # mm from its tip, or from a sheet's border
+    turned: Map  # by how much its outline turns more than a circle's, see `_edges`
+    half_mm: float  # half its width
+    blotch: Map
+    mottle: Map
+    grain: Map
+    lines: Map  # along it
+
+    @property
+    def across(self) -> Map:
+        """Place (h, 1) across the part, from -1 to 1."""
+        return np.linspace(-1, 1, len(self.along), dtype=np.float32)[:, None]
+
+
+@dataclass(frozen=True)
+class _Layers:
+    """Maps while they are painted: those of `FinishMaps`, and heights instead of normals."""
+
+    base: Map
+    bare: Map
+    rough: Map
+    mirror: Map
+    wet: Map
+    bumps: Map  # (h, w) mm
+
+
 def paint(
     finish: Finish,
     profile: Floats,
@@ -65,17 +108,42 @@ def paint(
 
     `turn`: as of `unfold`; `mm_per_px`: of the picture, as fine as which they are.
     """
-    height = int(np.clip(_WIDE_MM / mm_per_px, *_ACROSS))
-    size = height, 4 * height
+    texels = _lay_out(profile, sheet_rows, turn, kind, rng, mm_per_px)
+    layers = _wetted(finish, texels, _bloodied(finish, texels, _body(finish, texels)), rng)
+    base, mirror, bumps, rough = layers.base, layers.mirror, layers.bumps, np.clip(layers.rough, 0.05, 1)
+    if kind in ("suction", "tube"):
+        width = texels.along.shape[1]
+        bore = (np.linspace(0, 1, width) * (len(profile) // RING - 1) < _BORE_RINGS)[None, :, None]
+        base, mirror = base * np.where(bore, 0.06, 1), mirror * np.where(bore, 0.02, 1)
+        bumps = np.where(bore[..., 0], 0, bumps)
+    rough[..., 0] = np.clip(rough[..., 0], rough[..., 1], rough[..., 1] / _LEAST)
+    return FinishMaps(
+        base=np.clip(base, 0.003, 0.98).astype(np.float32),
+        bare=np.clip(layers.bare, 0, 1).astype(np.float32),
+        rough=rough.astype(np.float32),
+        wet=np.clip(layers.wet, 0, 1).astype(np.float32),
+        mirror=np.clip(mirror, 0, 0.98).astype(np.float32),
+        normal=_normals(bumps, texels.place),
+    )
+
+
+def _lay_out(
+    profile: Floats, sheet_rows: int, turn: int, kind: str, rng: np.random.Generator, mm_per_px: float
+) -> _Texels:
+    """The texels of a part; see `paint`."""
+    rings = profile.reshape(sheet_rows or -1, RING if not sheet_rows else len(profile) // sheet_rows, 3)
     if sheet_rows:
-        grid = profile.reshape(sheet_rows, -1, 3)
-        place, turned = _texels(grid, size), np.zeros(size, np.float32)
-        sides = np.abs(grid[..., :2])
-        inwards = (sides.max(axis=(0, 1)) - sides).min(axis=-1)
-        along = _texels(inwards[..., None], size)
+        height = int(np.clip(_WIDE_MM / mm_per_px, *_ACROSS))
+        size = height, 4 * height
+        place, turned = _texels(rings, size), np.zeros(size, np.float32)
+        sides = np.abs(rings[..., :2])
+        along = _texels((sides.max(axis=(0, 1)) - sides).min(axis=-1)[..., None], size)
     else:
-        rings = profile.reshape(-1, RING, 3)
         shown = _shown(turn)
+        body = rings[len(rings) // 3, shown]
+        outline = float(np.linalg.norm(np.diff(body, axis=0), axis=1).sum())
+        height = int(np.clip(max(_WIDE_MM, 0.9 * outline) / mm_per_px, *_ACROSS))
+        size = height, min(4 * height, _MOST_ALONG)
         rows = np.interp(np.linspace(0, 1, height), _share_of_outline(rings[:, shown]), np.arange(len(shown)))
         place = _texels(rings[:, shown].swapaxes(0, 1), size, rows)
         turned = _texels(_edges(rings)[:, shown].T[..., None], size, rows)
@@ -87,70 +155,77 @@ def paint(
     width = np.linalg.norm(np.gradient(place, axis=0), axis=-1).sum(axis=0)
     fade = step(1.6 * width / width[: size[1] // 2].max() - 0.9)
     lines = grain if sheet_rows else fade * _lines(size, rng)
-    worn = step((turned + 0.3 * blotch + 0.15 * grain - 1.5 * (1 - finish.wear)) / 0.4) * (finish.wear > 0)
-    edge = step(turned - 0.8) * (not kind.startswith(("finger", *CLOTH)))
+    return _Texels(kind, bool(sheet_rows), place, along, turned, 0.5 * wide, blotch, mottle, grain, lines)
+
+
+def _body(finish: Finish, texels: _Texels) -> _Layers:
+    """Bare metal with its lines, wear and shapes, under the coat."""
+    kind, along, lines, mottle = texels.kind, texels.along, texels.lines, texels.mottle
+    unworn = texels.turned + 0.3 * texels.blotch + 0.15 * texels.grain - 1.6 + 1.5 * finish.wear
+    worn = step(unworn / 0.4) * (finish.wear > 0)
+    edge = step(texels.turned - 0.8) * (not kind.startswith(("finger", *CLOTH)))
     coat = step((along - finish.bare_mm) / 0.06) * (1 - worn)
     bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn) + 0.004 * coat * mottle
     bumps = bumps + 0.0012 * (1 - coat) * lines * (1 + 8 * finish.brushed)
-    if kind == "spatula":  # no blade is flat
-        bumps = bumps + _WARP * blotch * (1 - coat)
-
-    rub = np.exp((0.25 + finish.brushed) * lines)
+    if kind == "spatula":  # no blade is flat: it is hollowed by rolling, and bent in use
+        bumps = bumps + (_WARP * texels.blotch + _HOLLOW * texels.half_mm * texels.across**2) * (1 - coat)
+    rub = np.exp((0.1 + 0.8 * finish.brushed) * lines)
     rough = np.stack([finish.alpha * max(finish.streak, 1.0) * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
     rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn)
-    base = (
-        np.asarray(finish.mirror, np.float32) * (1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle)[..., None]
-    )
-    if kind in ("forceps", "bayonet"):
+    bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
+    base = np.asarray(finish.mirror, np.float32) * bright[..., None]
+    base, bumps = _shaped(texels, coat, base, bumps)
+    painted = np.asarray(finish.coat, np.float32) * np.clip(1 + 0.05 * mottle + 0.08 * lines, 0, 2)[..., None]
+    base = over(base, painted, coat[..., None])
+    rough = over(rough, np.full(1, finish.coat_alpha, np.float32), coat[..., None])
+    bare = (1 - coat) * (1 - finish.scattered)
+    return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
+
+
+def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map]:
+    """Base and bumps with forceps' serrations, or the rings that are etched into shafts."""
+    along = texels.along
+    if texels.kind in ("forceps", "bayonet"):
         start, end, period = _SERRATION_MM
         teeth = step((along - start) / 0.3) * step((end - along) / 0.6) * (1 - coat)
-        across = np.abs(np.linspace(-1, 1, size[0], dtype=np.float32))[:, None]
-        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 3 * teeth * step((across - 0.62) / 0.3)
-        bumps, base = bumps - 0.06 * notch, base * (1 - 0.75 * notch[..., None])
-    if kind in ("dissector", "suction"):
+        inner = step((np.abs(texels.across) - 0.62) / 0.3)
+        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 3 * teeth * inner
+        return base * (1 - 0.75 * notch[..., None]), bumps - 0.06 * notch
+    if texels.kind in ("dissector", "suction"):
         every, apart, width = _MARKS_MM
         ring = np.mod(along - 0.5 * every, every)
         mark = (ridge(ring, width, 0.5) + ridge(ring, width, 0.5 + apart)) * (along > every) * (1 - coat)
-        base, bumps = base * (1 - 0.6 * mark[..., None]), bumps - 0.02 * mark
-    painted = np.asarray(finish.coat, np.float32) * np.clip(1 + 0.05 * mottle + 0.08 * lines, 0, 2)[..., None]
-    base, bare = over(base, painted, coat[..., None]), (1 - coat) * (1 - finish.scattered)
-    rough = over(rough, np.full(1, finish.coat_alpha, np.float32), coat[..., None])
-    mirror = over(base, _PLASTIC, coat[..., None])
+        return base * (1 - 0.6 * mark[..., None]), bumps - 0.02 * mark
+    return base, bumps
 
-    # Blood: a film that is brightest red where it is thin, a clot where it is thick, a bead at its border.
-    uneven = 0.45 * blotch + 0.3 * mottle + 0.1 * grain
-    share = 2 * finish.blood - 0.4 - along / max(finish.blood_mm, 0.1) + uneven
-    shown_to = step((1.3 * finish.blood_mm - along) / 2) * (finish.blood > 0)
+
+def _bloodied(finish: Finish, texels: _Texels, layers: _Layers) -> _Layers:
+    """With blood: a film that is brightest red where it is thin, a clot where it is thick, and its border."""
+    uneven = 0.55 * texels.blotch + 0.14 * texels.mottle
+    share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven
+    shown_to = step((1.3 * finish.blood_mm - texels.along) / 2) * (finish.blood > 0)
     deep = np.clip(share / 0.9 + 0.2, 0, 1.4) * shown_to
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5)
-    base = over(through(base, deep + 0.25 * ridge(deep, 0.12, 0.12) * film, _FILM), _BLOOD, clot[..., None])
-    bare = bare * (1 - clot)
-    mirror = over(through(mirror, deep, _FILM), _PLASTIC, clot[..., None])
-    bumps = bumps + 0.07 * step(deep / 0.35 - 0.5) + 0.02 * mottle * clot
-    # Water: a wavy film on the tip, drops further up.
-    wet = step((finish.wet_mm * (1 + 0.5 * blotch) - along) / 1.2 + 0.3 * mottle) * (finish.wet_mm > 0)
-    drops = _drops(place, along, finish, rng)
-    bumps = bumps + drops + 0.008 * wet * mottle
-    wet = np.maximum.reduce([0.8 * wet, film, step(drops / 0.02 - 0.5)])
-    if kind in CLOTH:
-        wet = 0.3 * wet
-    rough = over(
-        rough, np.full(1, 0.1, np.float32), (0.6 * np.maximum(film, clot) * (kind not in CLOTH))[..., None]
+    edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
+    smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]
+    return _Layers(
+        base=over(through(layers.base, edged, _FILM), _BLOOD, clot[..., None]),
+        bare=layers.bare * (1 - clot),
+        rough=over(layers.rough, np.full(1, 0.1, np.float32), smooth),
+        mirror=over(through(layers.mirror, deep, _FILM), _PLASTIC, clot[..., None]),
+        wet=film,
+        bumps=layers.bumps + _BLOOD_MM * (step(deep / 0.7 - 0.5) + 0.15 * texels.mottle * clot),
     )
-    if kind in ("suction", "tube"):
-        bore = (np.linspace(0, 1, size[1]) * (len(profile) // RING - 1) < _BORE_RINGS)[None, :, None]
-        base, mirror = base * np.where(bore, 0.06, 1), mirror * np.where(bore, 0.02, 1)
-        bumps = np.where(bore[..., 0], 0, bumps)
-    rough = np.clip(rough, 0.05, 1)
-    rough[..., 0] = np.clip(rough[..., 0], rough[..., 1], rough[..., 1] / _LEAST)
-    return FinishMaps(
-        base=np.clip(base, 0.003, 0.98).astype(np.float32),
-        bare=np.clip(bare, 0, 1).astype(np.float32),
-        rough=rough.astype(np.float32),
-        wet=np.clip(wet, 0, 1).astype(np.float32),
-        mirror=np.clip(mirror, 0, 0.98).astype(np.float32),
-        normal=_normals(bumps, place),
-    )
+
+
+def _wetted(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
+    """With water: a wavy film on the tip, drops further up."""
+    ends = finish.wet_mm * (1 + 0.5 * texels.blotch) - texels.along
+    wet = step(ends / 1.2 + 0.3 * texels.mottle) * (finish.wet_mm > 0)
+    drops = _drops(texels.place, texels.along, finish, rng)
+    bumps = layers.bumps + drops + 0.003 * wet * texels.mottle
+    wet = np.maximum.reduce([0.8 * wet, layers.wet, step(drops / 0.02 - 0.5)])
+    return replace(layers, bumps=bumps, wet=0.3 * wet if texels.kind in CLOTH else wet)
 
 
 def noise(at: Floats | Map, wave_mm: float, rng: np.random.Generator) -> Map:
@@ -187,6 +262,7 @@ def _lines(size: tuple[int, int], rng: np.random.Generator) -> Map:
     """Lines (h, w) along a part, each of some length, unit variance."""
     coarse = rng.normal(size=(size[0], 12)).astype(np.float32)
     lines = cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_LINEAR)
+    lines = cv2.GaussianBlur(lines, (1, 0), sigmaX=1e-3, sigmaY=_LINES_PX)  # as wide as the picture resolves
     return np.asarray(lines / lines.std(), np.float32)
 
 
@@ -195,13 +271,18 @@ def _drops(place: Map, along: Map, finish: Finish, rng: np.random.Generator) -> 
     high = np.zeros(along.shape, np.float32)
     if not finish.wet_mm:
         return high
-    reach = np.flatnonzero((along[len(along) // 2] > 0.3) & (along[len(along) // 2] < 3 * finish.wet_mm))
-    for _ in range(rng.poisson(2.5 * finish.wet_mm) if len(reach) else 0):
+    reach = np.flatnonzero(
+        (along[len(along) // 2] > 0.3) & (along[len(along) // 2] < min(3 * finish.wet_mm, _DROPS_MM))
+    )
+    for _ in range(rng.poisson(_DROPS * finish.wet_mm) if len(reach) else 0):
         row, column = rng.integers(len(along)), rng.choice(reach)
-        radius = float(np.exp(rng.uniform(np.log(0.08), np.log(0.4))))
-        near = np.flatnonzero(np.abs(along[row] - along[row, column]) < radius)
-        away2 = ((place[:, near] - place[row, column]) ** 2).sum(axis=-1) / radius**2
-        high[:, near] = np.maximum(high[:, near], 0.4 * radius * np.maximum(1 - away2, 0))
+        radius = float(np.exp(rng.uniform(np.log(_DROP_MM[0]), np.log(_DROP_MM[1]))))
+        near = np.flatnonzero(np.abs(along[row] - along[row, column]) < 2 * radius)
+        away = place[:, near] - place[row, column]
+        turn = np.arctan2(away[..., 1], away[..., 2]) + rng.uniform(0, 2 * np.pi)
+        ragged = radius * (1 + 0.25 * np.cos(2 * turn) + 0.12 * np.cos(3 * turn + 1))
+        away2 = (away**2).sum(axis=-1) / ragged**2
+        high[:, near] = np.maximum(high[:, near], _FLAT * radius * np.sqrt(np.clip(1.3 * (1 - away2), 0, 1)))
     return high
 
 

@@ -19,7 +19,7 @@ from synth.render.instrument import Part
 from synth.render.materials import Body, FinishMaps, Metal, stack_maps
 
 _DULL = Finish(  # a retractor's, darkened against glare
-    (0.42, 0.40, 0.38), 0.2, 1.6, scattered=0.05, wear=0.35, blood=0.3, blood_mm=5.0, wet_mm=3.0
+    (0.38, 0.365, 0.35), 0.2, 2.0, scattered=0.05, wear=0.35, blood=0.3, blood_mm=5.0, wet_mm=3.0
 )
 _CLIP_MM = 4.4, 1.7  # length and radius
 _GROUPS, _TOGETHER = (3, 6), (1, 4)  # clips: numbers of groups, and in each
@@ -63,7 +63,7 @@ def build_clips(
             place = int(turn / (2 * np.pi) * len(rim.edge)) % len(rim.edge)
             away = scale * (rim.edge[place] + rim.wall[place] + _BEHIND_MM)
             turn += (_CLIP_MM[0] + _GAP_MM) / away
-            skew, blood = float(rng.normal(0, 0.15)), float(rng.uniform(0.1, 0.45))
+            skew, blood = float(rng.normal(0, 0.15)), float(rng.uniform(0.02, 0.2))
             out = np.array([np.cos(turn), np.sin(turn), 0.0])
             near = np.linalg.norm(ground[:, :2] - away * out[:2], axis=1) < 1.5
             if not near.any():

@@ -27,9 +27,13 @@ def speckled(colour: Rgb, *contrasts: Array) -> Array:
 
 def through(colour: Array, depth: Array, absorption: Rgb) -> Array:
     """Colours (r, n, 3) under a layer (Beer-Lambert) of optical depth `depth` (r, n) times `absorption`."""
+    if not depth.any():  # of most rows, by most layers
+        return colour
     return np.asarray(colour * np.exp(-depth[..., None] * np.array(absorption, np.float32)))
 
 
 def over(below: Array, above: Array, share: Array) -> Array:
     """One layer (r, n, 3) or map (r, n) over another, of which it covers a share that broadcasts."""
+    if below.ndim == share.ndim and not share.any():
+        return below
     return np.asarray(below * (1 - share) + above * share)

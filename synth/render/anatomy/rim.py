@@ -27,6 +27,7 @@ from synth.render.materials import Coat
 _AROUND, _OUT = 240, 24  # at most: points around the opening, rings outwards
 _SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is built anew every frame
 _FINE = 8192  # angles at which outlines are read
+_TILE = 512  # side of the map of the finest noise
 _WIDTH_MM = 26.0  # of the rim; the picture ends before
 
 
@@ -107,6 +108,9 @@ class Wound:
     rise: float = 2.0  # of the wall
     shadow: Rgb = (0.6, 0.9, 0.9)  # absorption that darkens the gutter
     blood: Rgb = (0.3, 1.7, 2.1)  # absorption
+    bundles: int = 3  # of muscle's fibres, as many as the dura's
+    fat: Rgb = (0.62, 0.38, 0.16)  # albedo
+    fatty: float = 0.55  # share of it where there is some
 
 
 class Skin:
@@ -128,6 +132,7 @@ class Drape:
     """Surgical drapes: distance behind the wall's foot [mm], and albedos."""
 
     away: tuple[float, float] = 3.0, 0.8  # mean and spread
+    thread: float = 0.34  # from one of its threads to the next
     blue: Rgb = (0.07, 0.20, 0.42)
     green: Rgb = (0.06, 0.28, 0.26)
     blood: Rgb = (0.22, 0.02, 0.02)
@@ -237,10 +242,16 @@ def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
     maps = [x, y, drawn(9.0, 2.4), drawn(2.5, 2.2), drawn(0.6, 1.4)]
     streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
-    maps += [drawn(6.0, 3.4), _drops(rng, appearance.blood, rim, pixels)]
+    maps += [drawn(6.0, 3.4), _drops(rng, appearance.blood, rim, pixels), _fine(rng, pixels, extent)]
     colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, streaks), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    return Coat(colour, normals(noise.blur(bumps, 0.15, extent), extent), dry)
+    return Coat(colour, normals(noise.blur(bumps, 0.08, extent), extent), dry)
+
+
+def _fine(rng: np.random.Generator, pixels: int, extent_mm: float) -> Map:
+    """Noise (n, n) of unit variance down to the texels, of a tile that repeats."""
+    tile = noise.fractal(rng, _TILE, _TILE * extent_mm / pixels, 0.8, 1.3)
+    return np.tile(tile, (pixels // _TILE + 1,) * 2)[:pixels, :pixels]
 
 
 def _drops(rng: np.random.Generator, blood: float, rim: Rim, pixels: int) -> Map:
@@ -314,19 +325,21 @@ def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
 
 def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Albedo (r, n, 3), bumps mm and dry share (r, n) of some rows of the maps; see `paint` for `maps`."""
-    x, y, wide, mottle, grain, spilt, drops = maps
+    x, y, wide, mottle, grain, spilt, drops, fine = maps
     angle, mean = np.arctan2(y, x), float(rim.edge.mean())
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     reach, past = _round(rim.dura, angle), away - _round(rim.wall, angle)
     fibres = _fibres(streaks, angle, away, mean)
+    bundles = _fibres(streaks, Wound.bundles * angle + 0.15 * wide, away + 3 * mottle, mean)
     outer = step((away - reach) / 0.3 + 0.25 * mottle)
     gutter = outer * (1 - step(past / 1.5 + 0.3 * mottle))
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
     aside = _aside(angle, rim.stitches.astype(np.float32)[stitch])
     folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
-    crease = away - _round(rim.crease, angle) - 0.12 * mottle
+    start = _round(rim.crease, angle)
+    crease = away - start - 0.12 * mottle
     inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
-    turned = np.clip(_round(rim.crease, angle) - 0.5, 0, 1)
+    turned = np.clip(start - 0.5, 0, 1)
     soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * inner)
     deepest, level = Blood.pool
     full = spilt + 0.06 * mottle + level * (3 * appearance.blood - 3.1) - 0.8 * inner
@@ -336,18 +349,23 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     bloody = (
         soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
     )
-    dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain)
+    dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain, 0.04 * fine)
     dura = over(dura, speckled(Flap.albedo, 0.03 * mottle, 0.03 * fibres), 0.75 * inner[..., None])
     section = np.clip(0.6 + 0.3 * wide + 0.2 * mottle, 0, 0.85) * ridge(away, width=CutEdge.width)
     dura = through(dura, bloody * (1 - 0.7 * section), Wound.blood)
     dura = through(dura, turned * step(crease / 0.1) * np.exp(-np.abs(crease) / 0.35), Flap.shadow)
     colour = over(dura, np.asarray(CutEdge.albedo, np.float32), section[..., None])
-    beyond = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.08 * fibres)
+    beyond = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.26 * bundles, 0.07 * fine)
+    beyond = over(
+        beyond,
+        np.asarray(Wound.fat, np.float32),
+        Wound.fatty * step(wide - 0.9 + 0.5 * mottle + 0.2 * bundles)[..., None],
+    )
     if rim.bone:
-        beyond = _bone(beyond, past, mottle, grain)
+        beyond = _bone(beyond, past, mottle, grain + fine)
     skin = step((away - _round(rim.skin, angle)) / 1.5 + 0.25 * mottle) * (not rim.bone)
     stained = np.clip(appearance.blood * (1.3 - 0.25 * past) + 0.2 * mottle + 0.4 * wide, 0, 1.5)
-    pale = through(speckled(Skin.albedo, 0.04 * mottle, 0.03 * grain), stained, Wound.blood)
+    pale = through(speckled(Skin.albedo, 0.04 * mottle, 0.03 * grain, 0.06 * fine), stained, Wound.blood)
     beyond = over(through(beyond, 0.25 * soaked, Wound.blood), pale, skin[..., None])
     colour = over(colour, beyond, outer[..., None])
     colour = through(colour, np.clip(-away - 1.2, 0, 1), CutEdge.shadow)
@@ -355,16 +373,20 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         colour, gutter + 0.5 * ridge(away - reach, width=0.4) - 1.5 * np.minimum(folds, 0), Wound.shadow
     )
     wet = np.maximum(pool, drops) * (1 - skin)
-    bumps = (folds + 0.025 * mottle + 0.006 * grain) * (1 - 0.75 * wet) + 0.06 * wet
+    rough = 0.006 * grain + outer * (0.003 * fine + 0.02 * bundles)
+    bumps = (folds + 0.025 * mottle + rough) * (1 - 0.75 * wet) + 0.06 * wet
     bumps = bumps + Flap.height * turned * (
         step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
     )
     dry = np.clip(
-        0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner, 0.02, 1
+        0.6 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner,
+        0.02,
+        1,
     )
     if len(rim.cloth):
         cloth = away - _round(rim.cloth, angle)
-        colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
+        weave = np.cos(2 * np.pi / Drape.thread * x) * np.cos(2 * np.pi / Drape.thread * y) + 0.5 * fine
+        colour, bumps, dry = _draped(appearance, cloth, mottle, weave, colour, bumps, dry)
     if rim.held.any():
         across = np.where(rim.held[stitch], aside * (mean + away), 99.0).astype(np.float32)
         colour, bumps = _threaded(across, away, colour, bumps)
@@ -404,15 +426,15 @@ def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
 
 
 def _draped(
-    appearance: Appearance, past: Map, mottle: Map, grain: Map, colour: Map, bumps: Map, dry: Map
+    appearance: Appearance, past: Map, mottle: Map, weave: Map, colour: Map, bumps: Map, dry: Map
 ) -> tuple[Map, Map, Map]:
-    """Albedo, bumps and dry share with blue or green drapes from `past` = 0 mm on, bloody at their border."""
-    cloth = speckled((Drape.blue, Drape.green)[appearance.rim_seed % 2], 0.10 * grain, 0.05 * mottle)
+    """Albedo, bumps and dry share with woven drapes from `past` = 0 mm on, bloody at their border."""
+    cloth = speckled((Drape.blue, Drape.green)[appearance.rim_seed % 2], 0.22 * weave, 0.05 * mottle)
     blood = np.clip(appearance.blood * (1.1 - past / 2.0) + 0.3 * mottle, 0, 1.2)[..., None]
     cloth = cloth * (1 - 0.6 * np.minimum(blood, 1)) + np.array(Drape.blood, np.float32) * 0.6 * blood
     cover = step(past / 0.3 - 0.5)
     colour = np.asarray(colour + (cloth - colour) * cover[..., None], np.float32)
-    return colour, np.asarray(over(bumps, 0.012 * grain, cover), np.float32), np.maximum(dry, cover)
+    return colour, np.asarray(over(bumps, 0.012 * weave, cover), np.float32), np.maximum(dry, cover)
 
 
 def _under(surface: CortexSurface, xy: Floats) -> Floats:

@@ -40,6 +40,11 @@ class Parenchyma:
     pia: Rgb = (0.16, 1.0, 1.3)  # absorption
     perivascular: tuple[float, float] = 0.7, 1.1  # blur of arteries and of veins that redden the pia around
     deep: float = 0.16  # blur of vessels below the pia
+    net: tuple[float, float] = (
+        0.55,
+        0.1,
+    )  # of capillaries: wavelength, and width of its lines as a share of it
+    blush: float = 0.16  # optical depth of such a line
     scatter: Rgb = (0.055, 0.032, 0.026)  # blur by light that travels in tissue, farthest in red
 
 
@@ -58,7 +63,7 @@ class Bleeding:
     films: float = 2.2  # mean number on a patch whose rim is soaked with blood
     drops: float = 5.0
     radius: tuple[float, float] = 0.5, 1.8
-    drop_mm: tuple[float, float] = 0.08, 0.3
+    drop_mm: tuple[float, float] = 0.15, 0.32
     long: tuple[float, float] = 1.0, 2.6  # a film's length over its width
     depth: tuple[float, float] = 0.15, 0.6  # optical, of a film
     drop_depth: float = 1.4
@@ -69,24 +74,31 @@ class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
     absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
-    opaque: tuple[float, float] = 0.26, 0.11  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.7, 0.17, 0.1)  # albedo
-    wide: tuple[float, float] = 0.16, 0.24  # radius of the first opaque walls, and span to fully opaque ones
+    opaque: tuple[float, float] = 0.28, 0.14  # depth that even fine ones reach, and the chord for 63% of it
+    wall: Rgb = (0.74, 0.16, 0.085)  # albedo
+    wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
+    rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
+    rim_dark: Rgb = (0.35, 0.8, 0.7)  # absorption
+    covered: tuple[float, float] = 0.95, 0.28  # of its redness along it, by the arachnoid: mean, and spread
 
 
 class Vein:
     """Dark red where thin and at the sides, bluish along a thick one's crest, in a dark margin of tissue."""
 
-    thin: Rgb = (0.50, 0.13, 0.15)  # albedo
+    thin: Rgb = (0.42, 0.11, 0.14)  # albedo
     wide: tuple[float, float] = 0.12, 0.3  # radius at which a vein begins to be thick, span to fully thick
     margin: float = 0.8  # blur
     margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
-    rim: tuple[float, float] = 0.82, 0.24  # of a thick one's radius: middle and width of its dark rims
-    rim_dark: Rgb = (0.7, 1.1, 0.8)  # absorption
+    crest: float = 0.5  # of a thick one's radius: width of its bluish crest
+    rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
+    rim_dark: Rgb = (1.1, 1.5, 1.15)  # absorption
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
-    level: float = 0.65  # share of the pia's slope that a crest lacks: so it mirrors a lamp all along
-    dry: tuple[float, float] = 0.75, 0.2  # share of a thick one's crest under a thin film: mean, and spread
+    level: float = 0.85  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
+    # a wet wall is wavy, so that somewhere in each half millimetre it does, and the highlight never ends
+    dry: tuple[float, float] = 0.7, 0.25  # share of a thick one's crest under a thin film: mean, and spread
+    waves: float = 0.035  # standard deviation of the slopes of its wall's waves
+    waves_mm: float = 0.08  # blur that makes them
 
 
 class Film:
@@ -95,6 +107,7 @@ class Film:
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
+    reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.17  # standard deviation of slopes where the film is thin
     level: float = 0.9  # share of the pia's slope that a pool takes away
@@ -108,25 +121,35 @@ def resolution(extent_mm: float, mm_per_px: float) -> int:
 
 
 def cortex(
-    surface: CortexSurface, appearance: Appearance, pixels: int, photo: Path | None, shade: Map | None = None
+    surface: CortexSurface,
+    appearance: Appearance,
+    pixels: int,
+    photo: Path | None,
+    shade: Map | None = None,
+    mirror: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Coat:
     """Maps of parenchyma, vessels and wet film over the surface's chart, `pixels` on a side.
 
     `photo`: a picture that replaces the painted albedo; `shade`: (m, m) share of light that the rim lets
-    reach the surface; 1 if not given. UserError: the photograph cannot be read.
+    reach the surface; 1 if not given; `mirror`: slopes that mirror the main lamp into the lens, see
+    `light.mirror_slopes`. UserError: the photograph cannot be read.
     """
     extent = surface.chart.extent_mm
     rng = np.random.default_rng([surface.seed, 2])
     grown = surface.vessels
     drawn = {"veins": grown.visible_veins, "arteries": grown.arteries, "deep": grown.deep}
-    tubes = {name: tube.raster(tree, pixels, extent) for name, tree in drawn.items()}
+    # Fluid climbs along veins and arteries, along fine ones less far.
+    finest, wide = Film.reach_mm
+    margins = {name: np.clip(finest + tree.radius / 0.3, finest, wide) for name, tree in drawn.items()}
+    margins["deep"] = np.full(len(grown.deep.radius), extent / pixels)
+    tubes = {name: tube.raster(tree, pixels, extent, margins[name]) for name, tree in drawn.items()}
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
         red_least = np.array([0.7, 1.0, 1.0], np.float32)
         albedo = albedo * cv2.resize(shade, (pixels, pixels))[..., None] ** red_least
-    height, dry, level = _film(rng, appearance, tubes, sulci, shade, extent)
-    return Coat(albedo, normals(height, extent, _excess(surface, level)), dry)
+    height, dry, pools, veined = _film(rng, appearance, tubes, sulci, shade, extent)
+    return Coat(albedo, normals(height, extent, _excess(surface, pools, veined, mirror)), dry)
 
 
 def normals(height: Map, extent_mm: float, less: Map | None = None) -> Map:
@@ -161,9 +184,11 @@ def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, exte
     bled = _bleedings(rng, appearance.blood, pixels, extent)
     even = cv2.resize(mottle, (pixels, pixels))
     deep = noise.blur(chords["deep"], Parenchyma.deep, extent)
+    deep = deep + _net(rng, pixels, extent) / appearance.subpial_absorbance_per_mm
     tissue = [pale, grain, sulci, around, even, deep, _strands(rng, sulci, extent), bled]
     veins = _vein_maps(rng, tubes["veins"], extent)
-    arteries = [cv2.resize(wide, (pixels, pixels)), *tubes["arteries"]]
+    covered = cv2.resize(noise.band(rng, 128, extent, 6.0, 0.6), (pixels, pixels))
+    arteries = [covered, *tubes["arteries"]]
     (albedo,) = noise.in_rows(partial(_paint_rows, appearance), *tissue, *veins, *arteries)
     # Light that enters tissue leaves it nearby: a blur approximates the scattering volume.
     for channel, width in enumerate(Parenchyma.scatter):
@@ -214,6 +239,16 @@ def _strands(rng: Random, sulci: Map, extent: float) -> Map:
     return np.asarray(cv2.resize((line * bridged).astype(np.float32), sulci.shape[::-1]), np.float32)
 
 
+def _net(rng: Random, pixels: int, extent: float) -> Map:
+    """Optical depth (n, n) of a net of the finest vessels, denser in some places."""
+    small = min(pixels, 768)
+    wave, width = Parenchyma.net
+    line = ridge(noise.band(rng, small, extent, wave, 0.35), 2 * np.pi * width)
+    many = np.clip(0.6 + 0.5 * noise.band(rng, 96, extent, 5.0, 0.5), 0, 1.4)
+    depth = Parenchyma.blush * line * cv2.resize(many, (small, small))
+    return np.asarray(cv2.resize(depth.astype(np.float32), (pixels, pixels)), np.float32)
+
+
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
     """Optical depth (n, n) of a few films and drops of blood; films are thickest at their borders."""
     small = 384
@@ -251,7 +286,7 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
 def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their veins, by the maps of `_vein_maps`."""
     across, thick, along, cover, margin = maps
-    crest = (np.clip(0.6 + 0.3 * along, 0.1, 1) * thick * ridge(across, width=0.62))[..., None]
+    crest = (np.clip(0.6 + 0.3 * along, 0.1, 1) * thick * ridge(across, width=Vein.crest))[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
@@ -267,21 +302,24 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
     chord = thickness((distance, radius))
     most, soon = Artery.opaque
     reach = most * (1 - np.exp(-chord / soon)) + 0.08 * chord
-    fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
+    mean, spread = Artery.covered
+    fade = np.clip(mean + spread * wide, 0.35, 1.2)
     red = through(albedo, appearance.arterial_absorption * reach * fade, Artery.absorption_per_mm)
     # The wall of a wide artery scatters light itself, most along the crest.
     start, span = Artery.wide
     thick = np.clip((radius - start) / span, 0, 1) * (distance < radius)
-    crest = ridge(distance / np.maximum(0.7 * radius, 1e-3), width=1.0)
-    wall = np.array(Artery.wall, np.float32) * (0.78 + 0.27 * crest)[..., None]
-    return np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32)
+    across = distance / np.maximum(radius, 1e-3)
+    wall = np.array(Artery.wall, np.float32) * (0.7 + 0.4 * ridge(across, width=0.55))[..., None]
+    walled = red + (0.55 * thick * np.clip(fade, 0, 1))[..., None] * (wall - red)
+    middle, width = Artery.rim
+    return np.asarray(through(walled, thick * ridge(across, width, middle), Artery.rim_dark), np.float32)
 
 
 def _film(
     rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, shade: Map | None, extent: float
-) -> tuple[Map, Map, Map]:
-    """Height of the wet surface above the pia [mm], the share of it under too thin a film, and the share of
-    the pia's slope that it lacks."""
+) -> tuple[Map, Map, Map, Map]:
+    """Height of the wet surface above the pia [mm], the share of it under too thin a film, and the shares of
+    pools and of veins."""
     coarse = 256
     distance, radius = tubes["veins"]
     raised = np.sqrt(np.maximum(radius**2 - distance**2, 0)) - Vein.sunk * radius
@@ -314,23 +352,38 @@ def _film(
     tile = rng.standard_normal((_TILE, _TILE), np.float32)
     fine = np.tile(tile, (len(sulci) // _TILE + 1,) * 2)[: len(sulci), : len(sulci)]
     height = height + (Film.rough * extent / len(sulci)) * rough * fine
-    bare = cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA)
+    start, span = Vein.wide
+    wide = on_vein * np.clip((radius - start) / span, 0, 1)
+    height = height + wide * _waves(tile, extent, len(sulci))
+    bare, wide = (
+        cv2.resize(share, (coarse, coarse), interpolation=cv2.INTER_AREA) for share in (on_vein, wide)
+    )
     mean, spread = Vein.dry
     dry = over(dry, np.clip(mean + spread * noise.band(rng, coarse, extent, 3.0, 0.6), 0.1, 1), bare)
-    level = np.maximum(Film.level * pools, Vein.level * bare)
-    return np.asarray(height, np.float32), np.asarray(np.clip(dry, 0, 1), np.float32), level
+    return np.asarray(height, np.float32), np.asarray(np.clip(dry, 0, 1), np.float32), pools, wide
 
 
-def _excess(surface: CortexSurface, level: Map) -> Map:
+def _waves(tile: Map, extent: float, pixels: int) -> Map:
+    """Heights (n, n) mm of the waves of veins' walls, from a map of white noise that repeats."""
+    sigma = Vein.waves_mm * pixels / extent
+    smooth = cv2.GaussianBlur(np.pad(tile, 32, mode="wrap"), (0, 0), sigma)[32:-32, 32:-32]
+    high = Vein.waves * Vein.waves_mm * 2**0.5 / float(smooth.std()) * smooth
+    return np.tile(high, (pixels // _TILE + 1,) * 2)[:pixels, :pixels]
+
+
+def _excess(surface: CortexSurface, pools: Map, veined: Map, mirror: tuple[float, float, float]) -> Map:
     """Slopes (m, m, 2) of the mesh that the wet surface lacks: of veins, which are drawn finer than the mesh
-    resolves, and a share `level` (k, k) of the pia's."""
+    resolves, of the pia in `pools` (k, k), and under veins (k, k) less those of `mirror`, see `cortex`."""
     side = len(surface.pia)
     pia = surface.vertices.copy()
     pia[:, 2] = surface.pia.ravel()
     bent = [triangles.normals(triangles.Shape(at, surface.faces)) for at in (surface.vertices, pia)]
     whole, bare = (-normal[:, :2] / normal[:, 2:] for normal in bent)
-    lacking = noise.sample(level.astype(np.float32), surface.uv.astype(np.float64) - 0.5, 1.0)[:, None]
-    slopes = (whole - bare + lacking * bare).astype(np.float32).reshape(side, side, 2)
+    shares = np.stack([Film.level * pools, Vein.level * veined], axis=-1).astype(np.float32)
+    level, turned = noise.sample(shares, surface.uv.astype(np.float64) - 0.5, 1.0).T[..., None]
+    facing = np.asarray(mirror[:2]) + mirror[2] * surface.vertices[:, :2]
+    lacking = level * (1 - turned) * bare + turned * (bare - facing)
+    slopes = (whole - bare + lacking).astype(np.float32).reshape(side, side, 2)
     at = places(surface.chart, _SLOPES)
     return noise.sample(slopes, at, surface.extent_mm * side / (side - 1)).reshape(_SLOPES, _SLOPES, 2)
 

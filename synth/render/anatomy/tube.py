@@ -9,20 +9,22 @@ from synth.render.anatomy.tree import Tree
 from synth.system.jit import argument_types, vectorised
 
 
-def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float = 0.5) -> tuple[Map, Map]:
+def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float | Floats = 0.5) -> tuple[Map, Map]:
     """Distance to a centre line, and its radius, (pixels, pixels) float32 mm, of the vessel that a pixel lies
-    deepest in; farther than `margin_mm` from every vessel the distance is `extent_mm`, the radius 0."""
+    deepest in; farther than `margin_mm`, of all nodes or of each, (N,), from every vessel the distance is
+    `extent_mm`, the radius 0."""
     distance = np.full((pixels, pixels), np.float32(extent_mm))
     radius = np.zeros((pixels, pixels), np.float32)
     texels = (tree.nodes / extent_mm + 0.5) * pixels - 0.5
-    _draw(texels, tree.parent, tree.radius, pixels / extent_mm, margin_mm, distance, radius)
+    margins = np.ascontiguousarray(np.broadcast_to(np.asarray(margin_mm, np.float64), tree.radius.shape))
+    _draw(texels, tree.parent, tree.radius, pixels / extent_mm, margins, distance, radius)
     return distance, radius
 
 
-@argument_types("f8[:,::1], i8[::1], f8[::1], f8, f8, f4[:,::1], f4[:,::1]")
+@argument_types("f8[:,::1], i8[::1], f8[::1], f8, f8[::1], f4[:,::1], f4[:,::1]")
 @vectorised
 def _draw(
-    at: Floats, parent: Ints, wide: Floats, scale: float, margin: float, distance: Map, radius: Map
+    at: Floats, parent: Ints, wide: Floats, scale: float, margins: Floats, distance: Map, radius: Map
 ) -> None:
     """Draws round segments into the two maps; `at` in texels, of which a mm has `scale`."""
     rows, columns = distance.shape
@@ -31,7 +33,7 @@ def _draw(
         if p < 0:
             continue
         # A twig is not as wide as its trunk where it branches off.
-        first, last = min(wide[p], 1.3 * wide[k]), wide[k]
+        first, last, margin = min(wide[p], 1.3 * wide[k]), wide[k], margins[k]
         reach = (max(first, last) + margin) * scale
         x0, y0, dx, dy = at[p, 0], at[p, 1], at[k, 0] - at[p, 0], at[k, 1] - at[p, 1]
         whole = max(dx * dx + dy * dy, 1e-12)

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Ints, Map
+from synth.arrays import Floats, Ints, Map, Mask
 from synth.render.anatomy import colonisation, noise, tube
 from synth.render.anatomy.colonisation import Growth
 from synth.render.anatomy.layers import over
@@ -68,19 +69,27 @@ DEEP = Kind(
 )  # fmt: skip
 
 
-TRIBUTARIES = Growth(spacing=3.4, reach=9.0, near=1.7, step=0.25, straight=0.8, end=(0.05, 0.1))
+TRIBUTARIES = (
+    Growth(spacing=6.5, reach=14.0, near=3.2, step=0.25, straight=1.5, end=(0.14, 0.24)),
+    Growth(spacing=3.2, reach=8.0, near=1.6, step=0.2, straight=1.0, end=(0.035, 0.07)),
+)
 ARTERIOLES = (
-    Growth(spacing=2.2, reach=6.0, near=0.9, step=0.16, straight=0.9, end=(0.05, 0.07)),
-    Growth(spacing=0.95, reach=2.6, near=0.45, step=0.12, straight=0.7, end=(0.036, 0.055)),
-    Growth(spacing=0.46, reach=1.3, near=0.24, step=0.09, straight=0.5, end=(0.024, 0.04)),
+    Growth(spacing=2.6, reach=7.0, near=1.2, step=0.16, straight=1.4, end=(0.05, 0.07)),
+    Growth(spacing=1.0, reach=2.8, near=0.5, step=0.12, straight=1.2, end=(0.032, 0.046)),
+    Growth(spacing=0.48, reach=1.4, near=0.27, step=0.1, straight=1.0, end=(0.027, 0.034)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.18  # radius of such a vein
 _RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
+_ENTERS = 0.8  # depth of a sulcus, 0 to 1, from which a trunk may come into sight
+_BEHIND_MM = 0.8  # a trunk that starts nearer to what hides its start than this is not led on
+_LED_MM = 0.16  # spacing of the points by which it is led on
+_TWIG_MM = 0.4  # shorter side branches are left out: they look like thorns
+_ROUNDED = 18  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.45  # length over which arterioles and tributaries thin
-_WINDING = 0.07, 1.1  # shift of fine vessels, and over what distance
+_WINDING = 0.085, 1.0  # shift of fine vessels, and over what distance
 
 
 @dataclass(frozen=True)
@@ -105,17 +114,21 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
     deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
     smooth = _smooth(_pruned(veins, 0.05), 1.0)
-    visible = colonisation.fill(smooth, _targets(TRIBUTARIES, everywhere, extent_mm, rng), TRIBUTARIES, rng)
+    visible = smooth
+    for growth in TRIBUTARIES:
+        visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
     visible = _finished(visible, len(smooth.nodes), extent_mm, rng)
     distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
     beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
     free = (~beside * np.clip(0.9 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.35, 1)).astype(
         np.float32
     )
-    arteries = main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 0.8), extent_mm)
+    main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 1.0))
+    hidden = beside | (cv2.resize(sulci, beside.shape) > _ENTERS)
+    arteries = main = _led_in(main, hidden, extent_mm, rng)
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
-    arteries = _finished(arteries, len(main.nodes), extent_mm, rng)
+    arteries = _finished(_without_thorns(arteries), len(main.nodes), extent_mm, rng)
     return Vessels(veins, trunks, visible, arteries, _with_risers(deep, main, extent_mm))
 
 
@@ -141,19 +154,86 @@ def _smooth(tree: Tree, over_mm: float) -> Tree:
     return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
 
 
-def _slender(tree: Tree, extent_mm: float) -> Tree:
-    """The tree thinned towards its ends, where finer branches go on, and where it comes into sight inside."""
+def _slender(tree: Tree) -> Tree:
+    """The tree thinned towards its ends, where finer branches go on."""
     left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
-    radius = tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5
-    if len(roots := _roots_inside(tree, extent_mm)):
-        radius = radius * np.clip(0.15 + cKDTree(roots).query(tree.nodes)[0] / _RISE_MM, 0, 1)
-    return Tree(tree.nodes, tree.parent, radius)
+    return Tree(tree.nodes, tree.parent, tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5)
+
+
+def _led_in(tree: Tree, hidden: Mask, extent_mm: float, rng: np.random.Generator) -> Tree:
+    """The tree whose trunks that start in mid-field are led on backwards to where their start is hidden.
+
+    `hidden`: (m, m) clefts and wide veins; the patch's border and wider trunks of other trees hide it too.
+    """
+    screens, near = _screens(hidden, extent_mm), cKDTree(tree.nodes)
+    trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
+    while (trunk[trunk] != trunk).any():
+        trunk = trunk[trunk]
+    paths, radii, ends = list[Floats](), list[Floats](), list[int]()
+    for root in np.flatnonzero((tree.parent < 0) & _inside(tree, extent_mm)):
+        start = tree.nodes[root]
+        around = np.array(near.query_ball_point(start, 2.0))
+        around = around[trunk[around] == root]
+        wide, ahead = float(tree.radius[around].max()), (tree.nodes[around] - start).mean(axis=0)
+        ahead /= max(float(np.linalg.norm(ahead)), 0.2)
+        goals = np.concatenate([screens, tree.nodes[(trunk != root) & (tree.radius > wide)]])
+        away = np.hypot(*(goals - start).T)
+        if away.min() < _BEHIND_MM:  # it comes up there
+            risen = 0.15 + np.hypot(*(tree.nodes[around] - start).T) / (0.5 * _RISE_MM)
+            tree.radius[around] *= np.clip(risen, 0, 1)
+            continue
+        nearest = np.argmin(away * (1.4 + (goals - start) @ ahead / away))
+        long, goal = float(away[nearest]), goals[nearest]
+        part = np.linspace(0, 1, max(4, round(long / _LED_MM)))[:-1, None]
+        bend = start - 0.45 * long * ahead + rng.normal(0, 0.08 * long, 2)
+        paths.append((1 - part) ** 2 * goal + 2 * part * (1 - part) * bend + part**2 * start)
+        radii.append(wide * np.clip(0.05 + part[:, 0] * max(1, long / _RISE_MM), 0, 1) ** 0.7)
+        ends.append(int(root))
+    sizes = np.array([len(path) for path in paths], np.int64)
+    count = int(sizes.sum())
+    before = np.arange(-1, count - 1)
+    before[np.cumsum(sizes) - sizes] = -1
+    parent = np.where(tree.parent >= 0, tree.parent + count, -1)
+    parent[ends] = np.cumsum(sizes) - 1
+    made = Tree(
+        np.concatenate([*paths, tree.nodes]),
+        np.concatenate([before, parent]),
+        np.concatenate([*radii, tree.radius]),
+    )
+    return _smooth(made, 0.5)
+
+
+def _screens(hidden: Mask, extent_mm: float) -> Floats:
+    """Points (N, 2) mm of a mask (m, m), coarsely, and of the patch's border."""
+    row, column = np.nonzero(hidden[::8, ::8])
+    clefts = (np.column_stack([column, row]) * 8 + 0.5) * (extent_mm / len(hidden)) - extent_mm / 2
+    side, far = np.linspace(-0.46, 0.46, 32) * extent_mm, np.full(32, 0.46 * extent_mm)
+    ways = (side, far), (side, -far), (far, side), (-far, side)
+    return np.concatenate([clefts, *(np.column_stack(way) for way in ways)])
+
+
+def _without_thorns(tree: Tree) -> Tree:
+    """The tree without side branches shorter than `_TWIG_MM`."""
+    left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
+    left = left + np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
+    longest = np.zeros(len(left))
+    child = np.flatnonzero(tree.parent >= 0)
+    np.maximum.at(longest, tree.parent[child], left[child])
+    gone = (tree.parent >= 0) & (left < _TWIG_MM) & (left < longest[tree.parent])
+    for _ in range(round(_TWIG_MM / 0.05)):
+        gone |= gone[tree.parent] & (tree.parent >= 0)
+    number = np.append(np.where(gone, -1, np.cumsum(~gone) - 1), -1)
+    return Tree(tree.nodes[~gone], number[tree.parent[~gone]], tree.radius[~gone])
 
 
 def _roots_inside(tree: Tree, extent_mm: float) -> Floats:
     """Roots (n, 2) mm that are not at the patch's border."""
-    inside = np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm
-    return np.asarray(tree.nodes[(tree.parent < 0) & inside])
+    return np.asarray(tree.nodes[(tree.parent < 0) & _inside(tree, extent_mm)])
+
+
+def _inside(tree: Tree, extent_mm: float) -> Mask:
+    """Nodes (N,) that are not at the patch's border."""
+    return np.asarray(np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)
 
 
 def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:
@@ -176,7 +256,7 @@ def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:
 
 def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator) -> Tree:
     """The tree whose nodes from number `main` on have grown in, made to wind, and thinned to their ends."""
-    nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, 6)
+    nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, _ROUNDED)
     shift, wave = _WINDING
     winding = np.stack(
         [noise.sample(noise.band(rng, 256, extent_mm, wave, 0.5), nodes, extent_mm) for _ in range(2)], 1

@@ -73,6 +73,15 @@ def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
     return tuple(made)
 
 
+def mirror_slopes(camera: Camera, lamp: Lamp) -> tuple[float, float, float]:
+    """Slopes dz/dx and dz/dy at the origin of a surface that mirrors a lamp into the lens, and by how much
+    both rise with x and y [1/mm]."""
+    distances = np.linalg.norm([camera.centre, lamp.position], axis=1)
+    facing = camera.centre / distances[0] + lamp.position / distances[1]
+    x, y = (-facing[:2] / facing[2]).tolist()
+    return x, y, float((1 / distances).sum() / facing[2])
+
+
 def spot(camera: Camera, rest: Camera, even: float) -> Map:
     """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening: even within
     `even` widths of the field, fading outside; fixed to the microscope's pose `rest`."""
