@@ -43,8 +43,8 @@ def run(
 
 @lru_cache
 def flat_block(tets: int, even_mm: float) -> tuple[Tets, Shape]:
-    """The block of `tests/helpers/felupe_ogden.py`, finest within `even_mm` of the contact's middle, with a fine
-    surface."""
+    """The block of `tests/helpers/felupe_ogden.py`, finest within `even_mm` of the contact's middle, with a
+    fine surface."""
     size = np.array([40.0, 40.0, 20.0])
     points, cells = tetrahedra._bricks(size, 40)
     points, cells = refine(points, cells, lambda at: np.maximum(even_mm, np.linalg.norm(at, axis=1)), tets)
