@@ -1,4 +1,4 @@
-"""Draws the images of the gallery: families, instruments, lights, cameras and scenery side by side."""
+"""Draws the images of the gallery: families, instruments, lights, cameras, scenery and loads side by side."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from synth.publish.contact_sheet import pose_touching
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence.rest_scene import RestScene, at_rest
+from synth.sequence.simulation import simulate
 from synth.tune.search import changed
 
 Settings = dict[str, Any]  # values of a job's dotted keys
@@ -44,6 +45,19 @@ _SCENERY: dict[str, str] = {
     "retractor": "bayonet",
     "bone, drape, clips": "suction",
 }
+_LOADS: dict[str, Settings] = {
+    "retraction of 5 mm": {
+        "fem.gestures": ("retract",),
+        "fem.instrument": ("spatula",),
+        "fem.travel_mm": 5.0,
+    },
+    "grasp of 0.3 N": {
+        "fem.gestures": ("grasp",),
+        "fem.instrument": ("forceps",),
+        "fem.travel_mm": None,
+        "fem.force_mn": 300.0,
+    },
+}
 _CAPTION_PX = 24
 
 
@@ -69,6 +83,7 @@ def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, qua
     out.mkdir(parents=True, exist_ok=True)
     for name, rows in (("gallery-appearances", families), ("gallery-views", [*views, around])):
         _save(out / f"{name}.webp", rows, quality)
+    _save(out / "gallery-loads.webp", [_load(settings, name) for name, settings in _LOADS.items()], quality)
     job = changed(load_job("randomized"), {"render.stereo_mm": 0, "store.without": (), "sequences": 48})
     tiles = [_ready(at_rest(job, index)) for index in range(48)]
     _save(out / "gallery-randomized.webp", [tiles[k : k + 8] for k in range(0, 48, 8)], quality)
@@ -85,7 +100,22 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
     appearance = replace(case.appearance, scenery=job.render.scenery)
     case = replace(case, appearance=appearance, gestures=case.gestures[:1])
     shot = _ready(replace(rest, draw=replace(rest.draw, scenario=case)))
-    band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
+    return _with_caption(shot, caption)
+
+
+def _load(settings: Settings, name: str, frames: int = 25) -> list[Pixels]:
+    """Frames of a clinical load at 960 × 720: at rest, at a third, at two thirds and at its largest force."""
+    usual: Settings = {"frames": frames, "fps": frames / 3, "render.size": (960, 720), "render.spp": 16}
+    fem = {"fem.young_kpa": 3.0, "fem.membrane.probability": 0.0, "render.scenery": ()}
+    scene = simulate(changed(load_job("clinical"), usual | fem | settings))
+    force = np.linalg.norm(scene.force, axis=-1)
+    top = scene.strongest
+    rising = [int(np.argmin(np.abs(force[: top + 1] - share * force[top]))) for share in (0, 1 / 3, 2 / 3, 1)]
+    return [_with_caption(scene.frame(t).rgb, f"{name}: {force[t]:.0f} mN") for t in rising]
+
+
+def _with_caption(shot: Pixels, caption: str) -> Pixels:
+    band = np.full((_CAPTION_PX, shot.shape[1], 3), 255, np.uint8)
     cv2.putText(band, caption, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([band, shot])
 
