@@ -172,7 +172,7 @@ def _hold(surface: _Surface, tissue: TissueKind) -> Floats:
     taken = strsm(1.0, root, add(surface.across, added[rest, within]), lower=1, overwrite_b=1)
     held = add(surface.window, added[within, within])
     held -= ssyrk(1.0, taken, trans=1, lower=1)
-    return held
+    return np.asarray(held, np.float64)
 
 
 def _hold_alone(geometry: _Geometry, tissue: TissueKind) -> Floats:
@@ -192,8 +192,8 @@ def _condense(block: Block, poisson: float) -> _Surface:
     tissue = geometry.assemble_tissue(poisson)
     whole = condense(tissue, volume.points, volume.cells, geometry.nodes, volume.fixed).T
     rest, within = slice(len(whole) - len(geometry.loads)), slice(len(whole) - len(geometry.loads), None)
-    single = (np.asfortranarray(whole[rest, part], np.float32) for part in (rest, within))
-    return _Surface(geometry, *single, np.asfortranarray(whole[within, within]))
+    around, across = (np.asfortranarray(whole[rest, part], np.float32) for part in (rest, within))
+    return _Surface(geometry, around, across, np.asfortranarray(whole[within, within]))
 
 
 @lru_cache(maxsize=1)
