@@ -192,8 +192,8 @@ def _condense(block: Block, poisson: float) -> _Surface:
     tissue = geometry.assemble_tissue(poisson)
     whole = condense(tissue, volume.points, volume.cells, geometry.nodes, volume.fixed).T
     rest, within = slice(len(whole) - len(geometry.loads)), slice(len(whole) - len(geometry.loads), None)
-    alone, across = (np.asarray(whole[rest, part], np.float32, order="F") for part in (rest, within))
-    return _Surface(geometry, alone, across, np.asfortranarray(whole[within, within]))
+    around, across = (np.asfortranarray(whole[rest, part], np.float32) for part in (rest, within))
+    return _Surface(geometry, around, across, np.asfortranarray(whole[within, within]))
 
 
 @lru_cache(maxsize=1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from command import run
+from fake_run import in_process
 from pressed_block import PLACE, POISSON, STATES, STEP_S, YOUNG_KPA, solve, write
 from scipy import ndimage
 
@@ -18,6 +19,7 @@ from synth.job import identity
 from synth.job.schema import Job
 from synth.render.camera import camera
 from synth.sequence.job_series import read_job_series
+from synth.sequence.pipeline import render_sequence
 from synth.sequence.rest_scene import draw_craniotomy
 from synth.system import series_files
 
@@ -45,7 +47,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp_path: Path) -> None:
     """One state per frame; then at twice the rate; the exported surface, rendered again, is the same."""
-    synth.render_job(job_of(source, *FORCE), tmp_path / "a", workers=1)
+    in_process(job_of(source, *FORCE), tmp_path / "a", render_sequence)
     found = verify_dataset(tmp_path / "a")
     assert found.good, found.lines()
     sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
