@@ -86,10 +86,10 @@ _ENTERS = 0.8  # depth of a sulcus, 0 to 1, from which a trunk may come into sig
 _BEHIND_MM = 0.8  # a trunk that starts nearer to what hides its start than this is not led on
 _LED_MM = 0.16  # spacing of the points by which it is led on
 _TWIG_MM = 0.4  # shorter side branches are left out: they look like thorns
-_ROUNDED = 18  # rounds of smoothing of what has grown in, over some 0.3 mm
+_ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.45  # length over which arterioles and tributaries thin
-_WINDING = 0.085, 1.0  # shift of fine vessels, and over what distance
+_WINDING = 0.045, 1.2  # shift of fine vessels, and over what distance
 
 
 @dataclass(frozen=True)
