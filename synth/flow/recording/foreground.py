@@ -28,6 +28,7 @@ class Limits:
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
+    held: float = 0.1  # share of an object that the segmentation holds: more is an instrument, found in part
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
 
@@ -126,7 +127,8 @@ class ForegroundSearch:
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
         """Stores the largest component if it has this share of tissue and this extent in picture widths.
 
-        Without masks narrow ones are left out: they are instruments, or parts of them, not detected.
+        Without masks narrow ones are left out, which are instruments, or parts of them, not detected; and
+        those of which the segmentation holds a part: an instrument with its shadow.
         """
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
@@ -135,6 +137,8 @@ class ForegroundSearch:
         if not self._has_masks and why != _WIDE:
             wide = np.unique(label[_width(whole > 0) > Limits.wide * where.shape[1]])
             stats[np.setdiff1d(np.arange(len(stats)), wide)] = 0
+            held = np.bincount(label[_at_rest(frame.instruments, frame.flow)], minlength=len(stats))
+            stats[held > Limits.held * stats[:, cv2.CC_STAT_AREA]] = 0
         k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
         found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
         wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]
