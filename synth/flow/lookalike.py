@@ -39,7 +39,6 @@ class Limits:
     plain: float = 0.02  # `unlike` of a part that moves as all around it
     near: float = 0.1  # its `apart`
     farthest: float = 2.0  # limit of a change [local deviations]: pixels that are hidden count no more
-    frames: float = 0.5  # share of the frames that tell in which a region has to move as tissue
     bins: int = 16  # of each channel of colours
     alike: float = 0.15  # share of the mean density of proven colours from which a colour is proven too
     shared: float = (
@@ -51,14 +50,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Votes:
-    """What frames say of each region, (n,) counts of frames."""
+    """What frames say of each region, (n,) shares of the picture that tell it, summed over frames."""
 
-    told: Array
-    """That tell how it moves."""
     good: Array
-    """In which it moves as tissue."""
+    """Of frames in which it moves as tissue."""
     bad: Array
-    """In which it doesn't."""
+    """Of frames in which it doesn't."""
 
 
 class LookalikeSearch:
@@ -72,7 +69,7 @@ class LookalikeSearch:
         sizes = np.bincount(label.ravel(), minlength=count)
         self.regions = [label == k for k in range(1, count) if sizes[k] > Limits.small * label.size]
         """(H, W) each, that look like instruments; without any there is nothing to search."""
-        self._votes = Votes(*np.zeros((3, len(self.regions)), int))
+        self._votes = Votes(*np.zeros((2, len(self.regions))))
         self._moved = np.zeros(tissue.shape, bool)
 
     def add(self, frame: Pixels) -> None:
@@ -80,10 +77,8 @@ class LookalikeSearch:
         judged = _Judge(self._rest, frame, self._likely, self._shines)
         self._moved |= judged.moved
         for k, region in enumerate(self.regions):
-            told, good = judged.of(region)
-            self._votes.told[k] += told
-            self._votes.good[k] += told and good
-            self._votes.bad[k] += told and not good
+            told, is_tissue = judged.of(region)
+            (self._votes.good if is_tissue else self._votes.bad)[k] += told
 
     def find(self) -> Mask:
         """Tissue (H, W) of the rest frame that looks like instruments.
@@ -92,7 +87,7 @@ class LookalikeSearch:
         only these colours are taken: an instrument may lie on it.
         """
         votes, chosen = self._votes, np.zeros(self._likely.shape, bool)
-        is_tissue = votes.good > Limits.frames * votes.told
+        is_tissue = votes.good > votes.bad
         for k in np.flatnonzero(is_tissue):
             chosen |= self.regions[k]
         proven = self._moved & chosen
@@ -172,27 +167,29 @@ class _Judge:
         self._border = np.ones(size, bool)
         self._border[3:-3, 3:-3] = False
 
-    def of(self, region: Mask) -> tuple[bool, bool]:
-        """Whether the frame tells how a region (H, W) moves, and whether it moves as tissue."""
+    def of(self, region: Mask) -> tuple[float, bool]:
+        """Share of the picture that tells how a region (H, W) moves, 0 if too little, and whether it moves as
+        tissue."""
         wide, seen = _wider(region), region & self._free
         told = wide & self._told
-        moving = seen & (self._size > Limits.least_px)
-        if told.mean() < Limits.enough:
-            return False, False
+        moving, share = seen & (self._size > Limits.least_px), float(told.mean())
+        if share < Limits.enough:
+            return 0.0, False
         if not moving.any():
-            return True, False
+            return share, False
         apart = float(np.median(self._apart[moving] / self._size[moving]))
         unlike = float(np.mean(self._by_flow[seen] >= max(4 * self._noise, 0.6)))
         is_better = _ratio(self._by_flow, self._by_none, told) < Limits.better
         if not is_better or unlike >= Limits.unlike or apart >= Limits.apart:
-            return True, False
+            return share, False
         # A part that moves as all around it is tissue, unless a shaft may lead from it out of the picture.
         if apart < Limits.near and unlike < Limits.plain and not (region & self._border).any():
-            return True, True
+            return share, True
         rigid = _rigid(self._before, self._after, wide, self._flow)
         told = wide & self._tells(rigid)
         by_rigid = self._change(rigid)
-        return bool(told.mean() > Limits.enough), _ratio(self._by_flow, by_rigid, told) < Limits.better
+        is_told = told.mean() > Limits.enough
+        return share * is_told, _ratio(self._by_flow, by_rigid, told) < Limits.better
 
     def _change(self, motion: Map) -> Map:
         """Change (H, W), limited, that a motion (H, W, 2) px leaves [local deviations]."""

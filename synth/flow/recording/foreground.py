@@ -28,6 +28,10 @@ class Limits:
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
+    held: float = (
+        0.1  # share of an object on or next to what is segmented: more is an instrument, found in part
+    )
+    tip_px: int = 12  # what is next to it
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
 
@@ -126,7 +130,8 @@ class ForegroundSearch:
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
         """Stores the largest component if it has this share of tissue and this extent in picture widths.
 
-        Without masks narrow ones are left out: they are instruments, or parts of them, not detected.
+        Without masks narrow ones are left out, which are instruments, or parts of them, not detected; and
+        those of which the segmentation holds a part: an instrument with its shadow.
         """
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
@@ -135,6 +140,9 @@ class ForegroundSearch:
         if not self._has_masks and why != _WIDE:
             wide = np.unique(label[_width(whole > 0) > Limits.wide * where.shape[1]])
             stats[np.setdiff1d(np.arange(len(stats)), wide)] = 0
+            tools = cv2.dilate(frame.instruments.astype(np.uint8), _square(Limits.tip_px)) > 0
+            held = np.bincount(label[_at_rest(tools, frame.flow)], minlength=len(stats))
+            stats[held > Limits.held * stats[:, cv2.CC_STAT_AREA]] = 0
         k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
         found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
         wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]
@@ -192,9 +200,11 @@ def _at_rest(mask: Mask, flow: Map) -> Mask:
 
 
 def _width(mask: Mask) -> Map:
-    """Width (h, w) px of a mask around each of its pixels: twice the distance from its outline."""
-    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(2 * np.minimum(distance, mask.shape[1]), np.float32)
+    """Width (h, w) px of a mask around each of its pixels: twice the distance from its outline, of which the
+    border of the picture is a part: a rod that leaves there isn't as wide as its cut."""
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    distance = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    return np.asarray(2 * distance, np.float32)
 
 
 def _square(around_px: int) -> Pixels:

@@ -1,5 +1,7 @@
 """Findings on recordings: the same in `bench check` and `bench score`, and no scores with errors."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,12 +9,16 @@ from fake_recording import Maker, scored, texture
 from typer.testing import CliRunner
 
 from bench.checks.check_recording import check_recording
+from bench.checks.files import check_tissue
 from bench.checks.judgement import SENSOR_CHECKS
 from bench.checks.sensor import SensorMotion, find_other_rest
 from bench.cli import app
+from bench.recording.recording_folder import open_recording
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
+from bench.tracking.tracking import TrackedRecording
 from learn.cli import app as learn
+from synth.flow.recording.finding import Finding, Severity
 
 # E in Pa and in MPa, the scale in metres, pixels that are millimetres wide.
 UNITS = ("young_kpa", 1500.0), ("young_kpa", 0.0015), ("scale_mm_per_px", 2.5e-4), ("scale_mm_per_px", 3.0)
@@ -149,3 +155,12 @@ def test_a_single_black_frame_is_lost(make: Maker) -> None:
     cv2.imwrite(str(folder / "frames" / "0004.png"), BLACK)
     result = scored(folder, backend="dis")
     assert np.flatnonzero(result.lost).tolist() == [4]
+
+
+@pytest.mark.parametrize(("severity", "count"), [("error", 1), ("warning", 1), ("missing", 0)])
+def test_the_cost_of_a_wrong_tissue_is_said_only_where_the_one_found_is_in_doubt(
+    make: Maker, severity: Severity, count: int
+) -> None:
+    recording = open_recording(make(frames=2))
+    tracked = TrackedRecording(findings=[Finding(severity, "tissue", "found")])
+    assert len(check_tissue(replace(recording, tissue=None), tracked)) == count
