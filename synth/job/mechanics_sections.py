@@ -182,6 +182,9 @@ class MembraneSection(Section):
     the toe region it is thousands (ovine 7,700: Fluids Barriers CNS 17, 2020)."""
     thickness_mm: Range[Positive] = (0.05, 0.2)
     """Its thickness [mm], drawn uniformly. Only thickness times modulus matters."""
+    stiffening: Range[NonNegative] = (0.0, 0.0)
+    """Exponent b of its energy, drawn uniformly: a strip's tension grows by exp(b (l^2 + 2/l - 3)) at a
+    stretch l. 30: five times as stiff at a strain of 0.1 as at rest; 0: neo-Hookean."""
 
 
 class PulseSection(Section):

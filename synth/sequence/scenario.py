@@ -107,9 +107,10 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
     # Drawn even where unused, so that other numbers do not depend on whether there is a membrane.
     drawn, membrane = rng.uniform(), fem.membrane
     stiff, thick = _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm)
-    pia = Pia(stiff, thick, _uniform(rng, _STRETCH))
+    stretch = _uniform(rng, _STRETCH)
     poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
-    alpha = _uniform(rng, fem.alpha)  # the last one drawn
+    alpha = _uniform(rng, fem.alpha)
+    pia = Pia(stiff, thick, stretch, _uniform(rng, membrane.stiffening))  # the last one drawn
     return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull, alpha)
 
 

@@ -43,8 +43,7 @@ def run(
 
 @lru_cache
 def flat_block(tets: int, even_mm: float) -> tuple[Tets, Shape]:
-    """The block of `tests/helpers/felupe_ogden.py`, finest within `even_mm` of the contact's middle, with a
-    fine surface."""
+    """The block of `tests/helpers/felupe_ogden.py`, finest within `even_mm` of its middle; a fine surface."""
     size = np.array([40.0, 40.0, 20.0])
     points, cells = tetrahedra._bricks(size, 40)
     points, cells = refine(points, cells, lambda at: np.maximum(even_mm, np.linalg.norm(at, axis=1)), tets)
@@ -61,29 +60,56 @@ def marked(number: int, scene: dict) -> object:  # type: ignore[type-arg]
     return pytest.param(scene, marks=marks, id=f"{scene['radius']:g} {scene['alpha']:g} {scene['way']}")
 
 
+def driven(
+    radius: float, way: np.ndarray, poisson: float, alpha: float, places: np.ndarray, tets: int = 2400
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reaction (3,) mN and motion (P, 3) mm at places on felupe's block, of a disc that is driven."""
+    mesh, surface = flat_block(tets, 0.5 * radius)
+    length = float(np.linalg.norm(way))
+    disc = gesture(direction=tuple((way / length).tolist()), travel=length, size=(2 * radius,) * 2)
+    tissue = Tissue(1.0, poisson, "ogden", alpha=alpha)
+    area = surface_embedding.vertex_area(*surface)
+    embedding = surface_embedding.embed(mesh, surface.vertices)
+    held = driven_contact.layers([disc], tissue, embedding, surface.vertices, area)
+    base, motion = tissue.equations(mesh), trajectory(disc, 3)
+    path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *mesh.points.shape)))
+    assert path.way[1, 0] == pytest.approx(length)
+    u = path.displacement[1]
+    return held[0].reaction(u, path.way[1, 0]), surface_embedding.embed(mesh, places).move(u)
+
+
 @pytest.mark.parametrize("scene", list(starmap(marked, enumerate(FELUPE["scenes"]))))
 def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[type-arg]
-    radius = scene["radius"]
-    tets, surface = flat_block(2400 if radius < 6 else 3200, 0.5 * radius)
-    way = np.array(scene["way"])
-    length = float(np.linalg.norm(way))
-    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(2 * radius,) * 2)
-    tissue = Tissue(1.0, scene["poisson"], "ogden", alpha=scene["alpha"])
-    area = surface_embedding.vertex_area(*surface)
-    embedding = surface_embedding.embed(tets, surface.vertices)
-    held = driven_contact.layers([one], tissue, embedding, surface.vertices, area)
-    base, motion = tissue.equations(tets), trajectory(one, 3)
-    path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *tets.points.shape)))
-    force = held[0].reaction(path.displacement[1], path.way[1, 0])
-    assert path.way[1, 0] == pytest.approx(length)
-    wanted = np.array(scene["reaction"])
+    radius, places = scene["radius"], np.array(scene["places"])
+    tets = 2400 if radius < 6 else 3200
+    force, moved = driven(radius, np.array(scene["way"]), scene["poisson"], scene["alpha"], places, tets)
+    wanted, apart = np.array(scene["reaction"]), np.abs(moved - scene["displacement"])
     assert np.linalg.norm(force - wanted) <= 0.02 * np.linalg.norm(wanted)
-    places = surface_embedding.embed(tets, np.array(scene["places"]))
-    moved = places.move(path.displacement[1])
-    assert (
-        np.abs(moved - scene["displacement"]).max()
-        <= 0.03 * np.linalg.norm(scene["displacement"], axis=1).max()
-    )
+    assert apart.max() <= 0.03 * np.linalg.norm(scene["displacement"], axis=1).max()
+
+
+STUCK = 0.9  # radius of a disc that sticks over that in which a ball touches
+
+
+@pytest.mark.parametrize("scene", FELUPE["balls"], ids=lambda scene: f"{scene['depth']:g}")
+def test_a_disc_that_sticks_moves_tissue_as_a_ball_does_that_only_presses(scene: dict) -> None:  # type: ignore[type-arg]
+    x, depth = np.array(scene["places"]), scene["depth"]
+    places = np.column_stack([x, 0 * x, 0 * x])
+    way = np.array([0.0, 0.0, -depth])
+    force, moved = driven(STUCK * scene["touched"], way, scene["poisson"], scene["alpha"], places)
+    factor = scene["reaction"][2] / force[2]
+    assert 0.93 < factor < 1.07
+    apart = np.linalg.norm(factor * moved - scene["displacement"], axis=1)
+    assert apart[x > 1.2 * scene["touched"]].max() < 0.03 * depth
+
+
+def test_a_small_press_is_that_of_a_ball() -> None:
+    """F = 4/3 E* sqrt(R d^3) where a = sqrt(R d) touches (Johnson 1985, 4.2)."""
+    ball, depth = 6.0, 0.1
+    way, middle = np.array([0.0, 0.0, -depth]), np.zeros((1, 3))
+    force, _ = driven(STUCK * np.sqrt(ball * depth), way, 0.45, -8.0, middle)
+    hertz = 4 / 3 / (1 - 0.45**2) * np.sqrt(ball * depth**3)
+    assert -force[2] == pytest.approx(hertz, rel=0.07)
 
 
 @pytest.mark.parametrize(("kind", "way"), [("push", DOWN), ("retract", ASIDE), ("grasp", UP)])
