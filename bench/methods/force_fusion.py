@@ -33,6 +33,7 @@ class Fusion:
         self._share, self._alone, self._reason = 0.0, 0, ""
         self.video: VideoEstimates | None = None
         """What the last video's interval is computed from; None: a method stated no error."""
+        self.is_calibrated = False  # whether forces with this network and of this motion were
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: a fusion needs the estimates of its parts."""
@@ -86,6 +87,7 @@ class Fusion:
         `motion_mm`: (T,) mean length of the flow; `stated`: as of `VideoEstimates`; `network`: its identity.
         """
         self.video, self._reason = None, ""
+        self.is_calibrated = read_table().covers(network, scene.recovered_by)
         if self._alone or not fused:
             return list(fused)
         by_network, by_physics = (

@@ -1,12 +1,13 @@
 """One 90% interval of the leading force, from what a video shows and states without the truth.
 
 Half the width is P s(x) q. P is the video's largest estimate. s is the expected error over P, log-linear in
-features x of a frame (`ErrorModel`): the size of the estimate and the spread of physics' posterior, which
-knows what is stated and what two cameras see. q are the 5% and 95% quantiles of
-the error over P s, which differ as force is rather missed than invented, weighted so that each make and each
-of its recordings counts alike. `weights.interval_table` fits model and quantiles on the same recordings, and
-states what they hold by cross-validation over makes (`reached`). A video whose features lie beyond those of
-the table's recordings, or whose motion another estimator recovered, has no interval.
+features x of a frame (`ErrorModel`): the size of the estimate, the spread of physics' posterior, which knows
+what is stated and what two cameras see, the disagreement of network and physics over the video, and its amount
+of motion. q are the 5% and 95% quantiles of the error over P s, which differ as force is rather missed than
+invented, weighted so that each make and each of its recordings counts alike. `weights.interval_table` fits
+model and quantiles on the same recordings, and states what they hold by cross-validation over makes
+(`reached`). A video whose features lie beyond those of the table's recordings, or whose motion another
+estimator or version of it recovered, has no interval.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class IntervalTable:
     by_cameras: dict[int, CameraModel]
     makes: dict[str, int]  # recordings of each make
     networks: dict[str, str]  # identities of the calibrated networks, by name
-    flow: str  # estimator of their motion
+    flow: str  # estimator of their motion and its version, as of `name_motion`
     stating: dict[str, Positive]
     """Mean width of the intervals with what a recording may state over that without it."""
     reached: dict[str, dict[str, FiniteFloat]]
@@ -114,13 +115,17 @@ class IntervalTable:
                 gaps.append(f"{NAMES[name]} ({'low' if values[k] < error.low[k] else 'high'})")
         return gaps
 
+    def covers(self, network: str, recovered_by: str) -> bool:
+        """Whether forces fused with a network, of motion by an estimator and version, were calibrated."""
+        return network in self.networks.values() and recovered_by == self.flow
+
     def find_reason(self, video: VideoEstimates, network: str, recovered_by: str = "") -> str:
         """Why a video's force has no interval; empty if it has one.
 
         `network`: its identity; `recovered_by`: estimator of the motion and its version, empty if not known.
         """
-        if recovered_by and recovered_by.split()[0] != self.flow:
-            return f"no interval: it is calibrated for motion by {self.flow}"
+        if recovered_by and recovered_by != self.flow:
+            return f"no interval: it is calibrated for motion by {self.flow}, and this is by {recovered_by}"
         if network not in self.networks.values():
             return "no interval: it is calibrated for the pretrained networks"
         if gaps := self.find_gaps(video):

@@ -157,8 +157,10 @@ def _describe(
     parts = {name: one.parts if isinstance(one, Fusion) else (name,) for name, one in methods.items()}
     # The interval of a fusion is calibrated with its network as it is, or there is none.
     out.uncalibrated = {name for name, one in methods.items() if doubt[name] and not isinstance(one, Fusion)}
-    leading = parts.get(pictured, ())
-    out.doubt = [Finding("warning", part, note) for part in leading for note in doubt.get(part, ())]
+    leading, first = parts.get(pictured, ()), methods.get(pictured)
+    # Forces fused with this network, of this motion, were measured: what it learnt on isn't in doubt.
+    doubted = () if isinstance(first, Fusion) and first.is_calibrated else leading
+    out.doubt = [Finding("warning", part, note) for part in doubted for note in doubt.get(part, ())]
     for name, method in methods.items():
         warnings = getattr(method, "warnings", ())
         notes = [*(() if name in leading else doubt[name]), *getattr(method, "notes", ())]
