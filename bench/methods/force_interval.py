@@ -2,10 +2,10 @@
 
 Half the width is P s(x) q. P is the video's largest estimate. s is the expected error over P, log-linear in
 features x of a frame (`ErrorModel`): the size of the estimate, the spread of physics' posterior, which knows
-what is stated and what two cameras see, the disagreement of network and physics over the video, and its amount
-of motion. q are the 5% and 95% quantiles of the error over P s, which differ as force is rather missed than
-invented, weighted so that each make and each of its recordings counts alike. `weights.interval_table` fits
-model and quantiles on the same recordings, and states what they hold by cross-validation over makes
+what is stated and what two cameras see, the disagreement of network and physics over the video, and how much
+the tissue moves. q are the 5% and 95% quantiles of the error over P s, which differ as force is rather missed
+than invented, weighted so that each make and each of its recordings counts alike. `weights.interval_table`
+fits model and quantiles on the same recordings, and states what they hold by cross-validation over makes
 (`reached`). A video whose features lie beyond those of the table's recordings, or whose motion another
 estimator or version of it recovered, has no interval.
 """
