@@ -25,12 +25,22 @@ Step = tuple[str, Sequence[str]]
 """Its name, and the arguments after `python`."""
 
 _ONE_CAMERA = "render.stereo_mm=0", "store.without=[]"
+_SMALL = ("render.size=[256, 192]",)
 DATASETS: Mapping[str, tuple[str, ...]] = {
     "mission": ("mission", "sequences=240"),
     "mission-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80"),
     "gap-mission": ("mission", "sequences=375", *_ONE_CAMERA),
     "gap-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80", *_ONE_CAMERA),
-    "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", "render.size=[256, 192]"),
+    "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", *_SMALL),
+    "paper": (
+        "paper",
+        "sequences=90",
+        "frames=20",
+        "fps=11.1",
+        "anatomy.vertices=12000",
+        *_SMALL,
+        "flow.backend=ideal",
+    ),
     "stereo-640": ("stereo", "sequences=8", "seed=77", "render.size=[640, 480]"),
     "stereo-320": ("stereo", "sequences=8", "seed=77", "render.size=[320, 240]"),
 }
