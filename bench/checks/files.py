@@ -23,7 +23,7 @@ _NO_YOUNG = (
 )
 _WRONG_TISSUE = (
     "what a wrong tissue costs: masks that held half of it to a twentieth changed the force that physics "
-    "finds with one camera by factors of 0.3 to 1.6 in two rendered recordings"
+    "finds with one camera by factors of 0.3 to 1.6 in three rendered recordings"
 )
 
 

@@ -35,6 +35,10 @@ class Limits:
     rounds: int = 5  # of GrabCut
     small: float = 0.05  # share of the picture below which what is found is not the tissue
     solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
+    still: float = (
+        0.04  # share of what is found that is still though it should move: right ones 0.01, others 0.06
+    )
+    less: float = 0.02  # by which the outline without it may be less solid
     hollow: float = 0.75  # likewise, below which it is not the tissue
 
 
@@ -107,10 +111,14 @@ class TissueSearch:
                 return hull, _refuse(f"what moves is {100 * hull.mean():.2g}% of the picture")
             return hull, _state(text, "warning")
         guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
-        # From either guess tissue may be lost that instruments cut off: the rounder result is right.
-        guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))
-        found = [self._region(colours, one, core, hidden) for one in guesses]
-        tissue, solid = max(found, key=lambda one: one[1])
+        held = _morph(expected & still & ~moves, cv2.MORPH_OPEN, 2)  # still, though tissue there would move
+        outside = still & ~_inner(whole)
+        tissue, solid = self._choose(colours, guess, core, hidden, outside)
+        if tissue[held].sum() > Limits.still * tissue.sum():  # it reaches too far
+            guess[held & ~core] = cv2.GC_BGD
+            other = self._choose(colours, guess, core, hidden, outside)
+            if other[1] > solid - Limits.less:
+                tissue, solid = other
         text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
         if tissue.mean() < Limits.small:
             return tissue, _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
@@ -120,6 +128,14 @@ class TissueSearch:
             text += ", but with an uneven outline: see the picture of the masks"
             return tissue, _state(text, "warning")
         return tissue, _state(text)
+
+    def _choose(
+        self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask, outside: Mask
+    ) -> tuple[Mask, float]:
+        """Of two regions, from a guess and from one by colour, the rounder one: from either, tissue may be
+        lost that instruments cut off."""
+        guesses = guess, _by_colour(guess, colours, core, outside)
+        return max((self._region(colours, one, core, hidden) for one in guesses), key=lambda one: one[1])
 
     def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
