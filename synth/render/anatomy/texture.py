@@ -94,11 +94,11 @@ class Vein:
     rim_dark: Rgb = (1.1, 1.5, 1.15)  # absorption
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
-    level: float = 0.85  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
+    level: float = 0.97  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
     # a wet wall is wavy, so that somewhere in each half millimetre it does, and the highlight never ends
     dry: tuple[float, float] = 0.7, 0.25  # share of a thick one's crest under a thin film: mean, and spread
-    waves: float = 0.035  # standard deviation of the slopes of its wall's waves
-    waves_mm: float = 0.08  # blur that makes them
+    waves: float = 0.025  # standard deviation of the slopes of its wall's waves
+    waves_mm: float = 0.3  # blur that makes them
 
 
 class Film:
@@ -366,7 +366,7 @@ def _film(
 def _waves(tile: Map, extent: float, pixels: int) -> Map:
     """Heights (n, n) mm of the waves of veins' walls, from a map of white noise that repeats."""
     sigma = Vein.waves_mm * pixels / extent
-    smooth = cv2.GaussianBlur(np.pad(tile, 32, mode="wrap"), (0, 0), sigma)[32:-32, 32:-32]
+    smooth = cv2.GaussianBlur(np.pad(tile, 64, mode="wrap"), (0, 0), sigma)[64:-64, 64:-64]
     high = Vein.waves * Vein.waves_mm * 2**0.5 / float(smooth.std()) * smooth
     return np.tile(high, (pixels // _TILE + 1,) * 2)[:pixels, :pixels]
 

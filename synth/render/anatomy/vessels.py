@@ -85,10 +85,11 @@ _RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
 _ENTERS = 0.8  # depth of a sulcus, 0 to 1, from which a trunk may come into sight
 _BEHIND_MM = 0.8  # a trunk that starts nearer to what hides its start than this is not led on
 _LED_MM = 0.16  # spacing of the points by which it is led on
-_TWIG_MM = 0.4  # shorter side branches are left out: they look like thorns
+_TWIG_MM = 0.7  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.45  # length over which arterioles and tributaries thin
+_POINTED = 0.02, 0.09  # radius of a free end, and by how much it grows with each mm from there
 _WINDING = 0.045, 1.2  # shift of fine vessels, and over what distance
 
 
@@ -166,9 +167,7 @@ def _led_in(tree: Tree, hidden: Mask, extent_mm: float, rng: np.random.Generator
     `hidden`: (m, m) clefts and wide veins; the patch's border and wider trunks of other trees hide it too.
     """
     screens, near = _screens(hidden, extent_mm), cKDTree(tree.nodes)
-    trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
-    while (trunk[trunk] != trunk).any():
-        trunk = trunk[trunk]
+    trunk = _trunk_of(tree)
     paths, radii, ends = list[Floats](), list[Floats](), list[int]()
     for root in np.flatnonzero((tree.parent < 0) & _inside(tree, extent_mm)):
         start = tree.nodes[root]
@@ -270,7 +269,27 @@ def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator)
     )
     wide = np.clip(tree.radius / 0.3, 0, 1)
     radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
-    return Tree(nodes + supple[:, None] * winding, tree.parent, radius)
+    return _pointed(Tree(nodes + supple[:, None] * winding, tree.parent, radius), extent_mm)
+
+
+def _pointed(tree: Tree, extent_mm: float) -> Tree:
+    """The tree whose ends and roots inside the patch are pointed: what supplies them comes up from below."""
+    inside = _inside(tree, extent_mm)
+    left = remaining(tree.nodes, tree.parent, np.where(inside, 0.0, extent_mm))
+    trunk = _trunk_of(tree)
+    for root in np.flatnonzero((tree.parent < 0) & inside):
+        mine = trunk == root
+        left[mine] = np.minimum(left[mine], np.hypot(*(tree.nodes[mine] - tree.nodes[root]).T))
+    end, slope = _POINTED
+    return Tree(tree.nodes, tree.parent, np.minimum(tree.radius, end + slope * left))
+
+
+def _trunk_of(tree: Tree) -> Ints:
+    """The root (N,) that each node goes back to."""
+    trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
+    while (trunk[trunk] != trunk).any():
+        trunk = trunk[trunk]
+    return trunk
 
 
 def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
