@@ -24,7 +24,7 @@ SOLD: tuple[Rgb, ...] = (  # insulation: blue, black, white, green, yellow, grey
 )  # fmt: skip
 _GLOVES: tuple[Rgb, ...] = (0.76, 0.66, 0.48), (0.10, 0.22, 0.52), (0.34, 0.50, 0.40), (0.86, 0.84, 0.78)
 _SOFT = {"finger": _GLOVES, **dict.fromkeys(CLOTH, ((0.86, 0.82, 0.76),))}
-_COAT_ALPHAS, _COAT_STREAK = {True: (0.25, 0.45), False: (0.08, 0.13)}, 5.0  # of gloves; of insulation, paint
+_COAT_ALPHAS, _COAT_STREAK = {True: (0.25, 0.45), False: (0.08, 0.11)}, 9.0  # of gloves; of insulation, paint
 COATS_MM = 5.0, 7.0, 9.0, 12.0  # from the tip to where coats begin; meshes have rings there
 
 

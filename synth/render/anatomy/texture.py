@@ -108,7 +108,7 @@ class Film:
     reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.17  # standard deviation of slopes where the film is thin
-    level: float = 0.8  # share of the pia's slope that a pool takes away
+    level: float = 0.5  # share of the pia's slope that a pool takes away
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
@@ -339,7 +339,7 @@ def _film(
     dry = np.clip(thin, 0.05, 1.0)
     pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)
     dry = np.minimum(dry, 1 - pools)
-    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.6 * pools)
+    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.2 * pools)
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
     relief = relief * (1 - 0.97 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
     # A vein's wall is smooth, and its film thin: its crest mirrors the lamp in one broad line.
