@@ -93,7 +93,7 @@ class Vein:
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
     level: float = 0.97  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
-    # a wet wall is wavy, so that somewhere in each half millimetre it does, and the highlight never ends
+    # nearly all, so that the highlight never ends; the wall's long waves vary its width
     dry: tuple[float, float] = 0.7, 0.25  # share of a thick one's crest under a thin film: mean, and spread
     waves: float = 0.016  # standard deviation of the slopes of its wall's waves
     waves_mm: float = 0.3  # blur that makes them
