@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, ValidationInfo, model_validator
 
@@ -88,10 +88,10 @@ class RenderSection(Section):
     stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Baseline to a right camera [mm], for a stereo dataset: its pictures, and motion in three dimensions,
     true and recovered; 0: monocular."""
-    scenery: tuple[Scenery, ...] = get_args(Scenery)
+    scenery: tuple[Scenery, ...] = ("retractor", "bone", "drape")
     """Objects around the opening, each in a share of the sequences: a retractor's blade over its edge (one of
-    five), the bone's cut edge (one of three), drapes in the corners and clips on the cut skin (two of five).
-    They hide tissue and don't count as tissue."""
+    five), the bone's cut edge (one of three), drapes in the corners (two of five), and, where named, clips on
+    the cut skin (two of five). They hide tissue and don't count as tissue."""
 
     @model_validator(mode="after")
     def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:

@@ -20,10 +20,11 @@ _STREAKS = 3.2, 4.2, 1.0, 1.0  # of that along it
 _SHARES = 0.7, 0.3, 0.0, 0.0  # of these among instruments in use
 _INSULATED = {"forceps": 0.5, "bayonet": 0.6, "suction": 0.2, "spatula": 0.1}
 SOLD: tuple[Rgb, ...] = (  # insulation: blue, black, white, green, yellow, grey
-    (0.02, 0.08, 0.34), (0.02, 0.02, 0.02), (0.7, 0.7, 0.7), (0.03, 0.24, 0.14), (0.7, 0.5, 0.05), (0.3,) * 3
+    (0.05, 0.11, 0.29), (0.02, 0.02, 0.02), (0.7, 0.7, 0.7), (0.06, 0.21, 0.14), (0.6, 0.45, 0.12), (0.3,) * 3
 )  # fmt: skip
 _GLOVES: tuple[Rgb, ...] = (0.76, 0.66, 0.48), (0.10, 0.22, 0.52), (0.34, 0.50, 0.40), (0.86, 0.84, 0.78)
 _SOFT = {"finger": _GLOVES, **dict.fromkeys(CLOTH, ((0.86, 0.82, 0.76),))}
+_COAT_ALPHAS, _COAT_STREAK = {True: (0.25, 0.45), False: (0.08, 0.11)}, 9.0  # of gloves; of insulation, paint
 COATS_MM = 5.0, 7.0, 9.0, 12.0  # from the tip to where coats begin; meshes have rings there
 
 
@@ -37,7 +38,8 @@ class Finish:
     scattered: float = 0.0  # light that it scatters diffusely, as a share of what it mirrors
     brushed: float = 0.0  # contrast of its lines along the shaft
     coat: Rgb = (0.0, 0.0, 0.0)  # albedo
-    coat_alpha: float = 0.3
+    coat_alpha: float = 0.3  # its GGX roughness across the shaft
+    coat_streak: float = 1.0  # that along the shaft, as a multiple: by drawing and handling
     bare_mm: float = np.inf  # length from the tip without coat
     wear: float = 0.0  # 0 new to 1: edges rubbed bare and bright
     blood: float = 0.0  # share that is covered of
@@ -56,7 +58,7 @@ def draw_finish(strength: float, rng: np.random.Generator, kind: str) -> Finish:
     # From before its tip on: all of it, as paint or composite.
     bare = -1.0 if soft else float(rng.choice((-1.0, *COATS_MM) if wide else COATS_MM)) if coated else np.inf
     body = rng.choice(len(_ALPHAS), p=None if wide else _SHARES)
-    ranges = [_ALPHAS[body], (0.06, 0.15), (0.2, 0.5), (0.7, 1.0) if kind in CLOTH else (0.25, 0.45)]
+    ranges = [_ALPHAS[body], (0.06, 0.15), (0.2, 0.5), (0.7, 1.0) if kind in CLOTH else _COAT_ALPHAS[soft]]
     ranges += [(0, 1), (0.2, 1), (2, 30)] if wide else [(0, 0.15), (0.2, 0.7), (2, 7)]
     alpha, scattered, brushed, coat_alpha, wear, blood, long = rng.uniform(*np.transpose(ranges)).tolist()
     bloody = blood * (rng.random() < 0.6)
@@ -64,5 +66,6 @@ def draw_finish(strength: float, rng: np.random.Generator, kind: str) -> Finish:
     wet = 0.0 if soft else float(rng.choice([0.0, 1.5, 3.0, 5.0]))
     streak = _STREAKS[body]
     return Finish(
-        metal, alpha, streak, *body_only, coat, coat_alpha, bare, wear * (not soft), bloody, long, wet
-    )
+        metal, alpha, streak, *body_only, coat, coat_alpha, 1.0 if soft else _COAT_STREAK, bare,
+        wear * (not soft), bloody, long, wet,
+    )  # fmt: skip

@@ -177,7 +177,8 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     base, bumps = _shaped(texels, coat, base, bumps)
     painted = np.asarray(finish.coat, np.float32) * np.clip(1 + 0.05 * mottle + 0.08 * lines, 0, 2)[..., None]
     base = over(base, painted, coat[..., None])
-    rough = over(rough, np.full(1, finish.coat_alpha, np.float32), coat[..., None])
+    glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
+    rough = over(rough, glossy, coat[..., None])
     bare = (1 - coat) * (1 - finish.scattered)
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
 

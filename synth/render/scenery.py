@@ -25,7 +25,7 @@ _CLIP_MM = 4.4, 1.7  # length and radius
 _GROUPS, _TOGETHER = (3, 6), (1, 4)  # clips: numbers of groups, and in each
 _GAP_MM, _BEHIND_MM = 1.3, 0.9  # between two, and from the foot of the wound's wall
 _MARGIN = 0.15  # of the picture, outside which a clip is left out
-_COLOURS = (0.012, 0.03, 0.30), (0.012, 0.03, 0.30), (0.5, 0.55, 0.6)  # blue, or white
+_COLOURS = (0.03, 0.06, 0.24), (0.03, 0.06, 0.24), (0.5, 0.55, 0.6)  # blue, or white
 
 
 def build_retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int, mm_per_px: float) -> Body:

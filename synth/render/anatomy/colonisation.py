@@ -17,6 +17,8 @@ from synth.system.jit import argument_types, compiled
 
 _MOST = 60_000  # nodes
 _NEAR = 0.35  # of a step: a branch that ends nearer to its sister than this is the sister
+# Cosine and sine of the widest angle at which a side branch leaves.
+_FORWARD = float(np.cos(np.radians(50))), float(np.sin(np.radians(50)))
 _PUSHED = 0.4  # of a step, standard deviation of what a branch strays
 
 
@@ -119,6 +121,10 @@ def _grow(
             pull[k, 0], pull[k, 1] = 0.0, 0.0
             size = np.hypot(x, y) + 1e-9
             x, y = x / size, y / size
+            ahead, aside = heading[k, 0], heading[k, 1]
+            if child[k] >= 0 and ahead * ahead + aside * aside > 0.5 and x * ahead + y * aside < _FORWARD[0]:
+                turn = _FORWARD[1] if ahead * y - aside * x > 0 else -_FORWARD[1]
+                x, y = _FORWARD[0] * ahead - turn * aside, _FORWARD[0] * aside + turn * ahead
             at_x, at_y = nodes[k, 0] + step * x, nodes[k, 1] + step * y
             c = child[k]
             if c >= 0 and np.hypot(nodes[c, 0] - at_x, nodes[c, 1] - at_y) < _NEAR * step:

@@ -94,9 +94,10 @@ class Flap:
 class Blood:
     """Blood on the dura: pools with a level surface, smears wiped along the edge, drops."""
 
-    pool: tuple[float, float] = 2.6, 0.45  # optical depth, and how much of the noise is one
+    pool: tuple[float, float] = 4.2, 0.45  # optical depth where deepest, and how much of the noise is one
+    runs: float = 1.1  # mm that a pool runs over the dura's end, thinning
     smear: float = 0.8  # optical depth
-    drops: float = 26.0  # mean number on a soaked rim
+    drops: float = 12.0  # mean number on a soaked rim
     drop_mm: tuple[float, float] = 0.12, 0.55  # radius
 
 
@@ -266,7 +267,7 @@ def _drops(rng: np.random.Generator, blood: float, rim: Rim, pixels: int) -> Map
         axes = (2 * radius * scale * long, 2 * radius * scale / long)
         if min(axes) > 1:
             cv2.ellipse(drops, (middle.tolist(), axes, turn), 1.0, -1, cv2.LINE_AA)
-    return noise.blur(drops, 0.07, rim.extent_mm)
+    return noise.blur(drops, 0.12, rim.extent_mm)
 
 
 def shade(rim: Rim, surface: CortexSurface) -> Map:
@@ -340,11 +341,15 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     crease = away - start - 0.12 * mottle
     inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
     turned = np.clip(start - 0.5, 0, 1)
-    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * inner)
+    # Blood knows no crease: it thins over a millimetre.
+    clean = step((0.35 * fibres + 0.25 * mottle - crease) / 1.6)
+    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * clean)
     deepest, level = Blood.pool
-    full = spilt + 0.06 * mottle + level * (3 * appearance.blood - 3.1) - 0.8 * inner
-    pool = step(4 * full - 0.3) * min(1, 6 * appearance.blood)
-    depth = deepest * np.clip(0.35 + 1.2 * full, 0.25, 1)
+    ragged = 0.12 * mottle + 0.1 * fibres + 0.04 * grain
+    full = spilt + ragged + level * (3 * appearance.blood - 3.1) - 0.8 * clean
+    pool = step(1.8 * full - 0.3) * min(1, 6 * appearance.blood)
+    drops = drops * np.clip(0.8 + 0.45 * mottle + 0.25 * grain, 0, 1.4)
+    depth = deepest * np.clip(0.15 + 0.9 * full, 0.12, 1)
     wiped = np.clip(0.55 * fibres + 0.5 * wide - 0.6 + 0.8 * (appearance.blood - 0.5), 0, 1) * Blood.smear
     bloody = (
         soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
@@ -367,6 +372,8 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     stained = np.clip(appearance.blood * (1.3 - 0.25 * past) + 0.2 * mottle + 0.4 * wide, 0, 1.5)
     pale = through(speckled(Skin.albedo, 0.04 * mottle, 0.03 * grain, 0.06 * fine), stained, Wound.blood)
     beyond = over(through(beyond, 0.25 * soaked, Wound.blood), pale, skin[..., None])
+    run = np.clip((away - reach) / Blood.runs + 0.3 * mottle, 0, 3)
+    beyond = through(beyond, depth * pool * np.exp(-run) * (1 - skin), Wound.blood)
     colour = over(colour, beyond, outer[..., None])
     colour = through(colour, np.clip(-away - 1.2, 0, 1), CutEdge.shadow)
     colour = through(

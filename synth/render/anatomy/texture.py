@@ -58,15 +58,13 @@ class Sulcus:
 
 
 class Bleeding:
-    """Blood on the pia: thin films drawn out over it, and drops; pairs are ranges."""
+    """Blood on the pia: thin films drawn out over it; pairs are ranges."""
 
     films: float = 2.2  # mean number on a patch whose rim is soaked with blood
-    drops: float = 5.0
     radius: tuple[float, float] = 0.5, 1.8
-    drop_mm: tuple[float, float] = 0.15, 0.32
     long: tuple[float, float] = 1.0, 2.6  # a film's length over its width
     depth: tuple[float, float] = 0.15, 0.6  # optical, of a film
-    drop_depth: float = 1.4
+    ragged: float = 0.8  # share of a film's radius by which noise shifts its border
     blood: Rgb = (0.12, 1.5, 2.4)  # absorption
 
 
@@ -94,11 +92,11 @@ class Vein:
     rim_dark: Rgb = (1.1, 1.5, 1.15)  # absorption
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
-    level: float = 0.85  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
-    # a wet wall is wavy, so that somewhere in each half millimetre it does, and the highlight never ends
+    level: float = 0.97  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
+    # nearly all, so that the highlight never ends; the wall's long waves vary its width
     dry: tuple[float, float] = 0.7, 0.25  # share of a thick one's crest under a thin film: mean, and spread
-    waves: float = 0.035  # standard deviation of the slopes of its wall's waves
-    waves_mm: float = 0.08  # blur that makes them
+    waves: float = 0.016  # standard deviation of the slopes of its wall's waves
+    waves_mm: float = 0.3  # blur that makes them
 
 
 class Film:
@@ -110,7 +108,7 @@ class Film:
     reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.17  # standard deviation of slopes where the film is thin
-    level: float = 0.8  # share of the pia's slope that a pool takes away
+    level: float = 0.5  # share of the pia's slope that a pool takes away
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
@@ -250,23 +248,22 @@ def _net(rng: Random, pixels: int, extent: float) -> Map:
 
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
-    """Optical depth (n, n) of a few films and drops of blood; films are thickest at their borders."""
+    """Optical depth (n, n) of a few films of blood, thickest in the middle, thin at a ragged border."""
     small = 384
     axis = noise.centres(small, extent)
-    ragged = noise.fractal(rng, small, extent, 5.0, 3.0)
+    ragged = noise.fractal(rng, small, extent, 2.5, 2.2)
     total = np.zeros((small, small), np.float32)
-    numbers = rng.poisson([Bleeding.films * blood, Bleeding.drops * blood])
-    for drop, radii in zip([False] * numbers[0] + [True] * numbers[1], rng.random(sum(numbers)), strict=True):
+    for _ in range(rng.poisson(Bleeding.films * blood)):
         (x, y), turn = rng.uniform(-0.4, 0.4, 2) * extent, rng.uniform(0, np.pi)
-        least, most = Bleeding.drop_mm if drop else Bleeding.radius
-        radius = least * (most / least) ** radii
-        long = 1.0 if drop else rng.uniform(*Bleeding.long) ** 0.5
+        least, most = Bleeding.radius
+        radius = least * (most / least) ** rng.random()
+        long = rng.uniform(*Bleeding.long) ** 0.5
         u, v = axis[None] - x, axis[:, None] - y
         along, aside = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
-        inside = 1 - np.hypot(along / long, aside * long) / radius + (0.1 if drop else 0.45) * ragged
-        depth = Bleeding.drop_depth if drop else rng.uniform(*Bleeding.depth)
-        film = step(inside / 0.25 - 0.3) * (1 + (0 if drop else 0.5) * ridge(inside, width=0.15, at=0.22))
-        total += (depth * film).astype(np.float32)
+        away = np.hypot(along / long, aside * long) / radius
+        inside = np.clip((1 - away + Bleeding.ragged * ragged) / 0.8, 0, 1.3)
+        film = inside * step((1.6 - away) / 0.5)
+        total += (rng.uniform(*Bleeding.depth) * film).astype(np.float32)
     return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
@@ -342,7 +339,7 @@ def _film(
     dry = np.clip(thin, 0.05, 1.0)
     pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)
     dry = np.minimum(dry, 1 - pools)
-    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.6 * pools)
+    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.2 * pools)
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
     relief = relief * (1 - 0.97 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
     # A vein's wall is smooth, and its film thin: its crest mirrors the lamp in one broad line.
@@ -366,7 +363,7 @@ def _film(
 def _waves(tile: Map, extent: float, pixels: int) -> Map:
     """Heights (n, n) mm of the waves of veins' walls, from a map of white noise that repeats."""
     sigma = Vein.waves_mm * pixels / extent
-    smooth = cv2.GaussianBlur(np.pad(tile, 32, mode="wrap"), (0, 0), sigma)[32:-32, 32:-32]
+    smooth = cv2.GaussianBlur(np.pad(tile, 64, mode="wrap"), (0, 0), sigma)[64:-64, 64:-64]
     high = Vein.waves * Vein.waves_mm * 2**0.5 / float(smooth.std()) * smooth
     return np.tile(high, (pixels // _TILE + 1,) * 2)[:pixels, :pixels]
 

@@ -74,9 +74,9 @@ TRIBUTARIES = (
     Growth(spacing=3.2, reach=8.0, near=1.6, step=0.2, straight=1.0, end=(0.035, 0.07)),
 )
 ARTERIOLES = (
-    Growth(spacing=2.6, reach=7.0, near=1.2, step=0.16, straight=1.4, end=(0.05, 0.07)),
-    Growth(spacing=1.0, reach=2.8, near=0.5, step=0.12, straight=1.2, end=(0.032, 0.046)),
-    Growth(spacing=0.48, reach=1.4, near=0.27, step=0.1, straight=1.0, end=(0.027, 0.034)),
+    Growth(spacing=2.6, reach=7.0, near=1.2, step=0.16, straight=1.4, end=(0.045, 0.065)),
+    Growth(spacing=1.0, reach=2.8, near=0.5, step=0.12, straight=1.2, end=(0.028, 0.04)),
+    Growth(spacing=0.48, reach=1.4, near=0.27, step=0.1, straight=1.0, end=(0.022, 0.029)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
@@ -85,10 +85,12 @@ _RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
 _ENTERS = 0.8  # depth of a sulcus, 0 to 1, from which a trunk may come into sight
 _BEHIND_MM = 0.8  # a trunk that starts nearer to what hides its start than this is not led on
 _LED_MM = 0.16  # spacing of the points by which it is led on
-_TWIG_MM = 0.4  # shorter side branches are left out: they look like thorns
+_TWIG_MM = 0.6  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.45  # length over which arterioles and tributaries thin
+_POINTED = 0.02, 0.09  # radius of a free end, and by how much it grows with each mm from there
+_WIDENS = 1.05  # times, at most and besides, from a node to the next one up
 _WINDING = 0.045, 1.2  # shift of fine vessels, and over what distance
 
 
@@ -166,9 +168,7 @@ def _led_in(tree: Tree, hidden: Mask, extent_mm: float, rng: np.random.Generator
     `hidden`: (m, m) clefts and wide veins; the patch's border and wider trunks of other trees hide it too.
     """
     screens, near = _screens(hidden, extent_mm), cKDTree(tree.nodes)
-    trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
-    while (trunk[trunk] != trunk).any():
-        trunk = trunk[trunk]
+    trunk = _trunk_of(tree)
     paths, radii, ends = list[Floats](), list[Floats](), list[int]()
     for root in np.flatnonzero((tree.parent < 0) & _inside(tree, extent_mm)):
         start = tree.nodes[root]
@@ -270,7 +270,34 @@ def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator)
     )
     wide = np.clip(tree.radius / 0.3, 0, 1)
     radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
-    return Tree(nodes + supple[:, None] * winding, tree.parent, radius)
+    return _pointed(Tree(nodes + supple[:, None] * winding, tree.parent, radius), extent_mm)
+
+
+def _pointed(tree: Tree, extent_mm: float) -> Tree:
+    """The tree whose ends and roots inside the patch are pointed, and that narrows nowhere at once."""
+    inside = _inside(tree, extent_mm)
+    end, slope = _POINTED
+    length = np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
+    most = np.where(inside, end, np.inf)
+    childless = np.bincount(tree.parent + 1, minlength=len(most) + 1)[1:] == 0
+    wide, limit = tree.radius.tolist(), np.where(childless, most, 0.0).tolist()
+    for k, up in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
+        wide[k] = min(wide[k], limit[k])
+        if up >= 0:
+            limit[up] = max(limit[up], _WIDENS * wide[k] + slope * float(length[k]))
+    radius, trunk = np.array(wide), _trunk_of(tree)
+    for root in np.flatnonzero((tree.parent < 0) & inside):
+        away = np.hypot(*(tree.nodes - tree.nodes[root]).T)
+        radius = np.where(trunk == root, np.minimum(radius, end + slope * away), radius)
+    return Tree(tree.nodes, tree.parent, radius)
+
+
+def _trunk_of(tree: Tree) -> Ints:
+    """The root (N,) that each node goes back to."""
+    trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
+    while (trunk[trunk] != trunk).any():
+        trunk = trunk[trunk]
+    return trunk
 
 
 def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:

@@ -58,7 +58,7 @@ class Ranges:
     grain: Ends = (0.008, 0.02)
     fluid_smoothing_mm: Ends = (0.035, 0.06)
     bump: Ends = (0.8, 1.3)
-    roughness: Ends = (0.012, 0.02)
+    roughness: Ends = (0.028, 0.04)
     dry_roughness: Ends = (0.11, 0.16)
     blood: Ends = (0.25, 0.75)
     dura_albedo: Colour = (0.86, 0.6, 0.5)

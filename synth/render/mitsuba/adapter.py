@@ -29,6 +29,7 @@ from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
 
 _REGISTER = 64  # bytes of a vector register
+_LACQUER = 1.7  # refractive index of coats, glossier than plain plastic's 1.5
 _GLOSS = 0.88  # of a liquid's surface, as of `principled`
 _LAMPS = 2, 6, 12  # numbers of lamps, each with a kernel of its own
 
@@ -276,7 +277,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
         steel: dict[str, Any] = {"type": "principled", "base_color": _bitmap(mi, maps.base)}
         steel |= {"metallic": _bitmap(mi, maps.bare), "roughness": _bitmap(mi, (along * across) ** 0.25)}
         steel |= {"anisotropic": _bitmap(mi, (1 - across / along) / 0.9)}
-        steel |= {"clearcoat": _bitmap(mi, maps.wet), "clearcoat_gloss": _GLOSS}
+        steel |= {"clearcoat": _bitmap(mi, maps.wet), "clearcoat_gloss": _GLOSS, "eta": _LACQUER}
         encoded = maps.normal * np.float32(0.5) + np.float32(0.5)
         bent = {"type": "normalmap", "normalmap": _bitmap(mi, encoded), "steel": steel}
         return {"type": "twosided", "bent": bent}
