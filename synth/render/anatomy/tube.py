@@ -16,7 +16,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float | Floats 
     distance = np.full((pixels, pixels), np.float32(extent_mm))
     radius = np.zeros((pixels, pixels), np.float32)
     texels = (tree.nodes / extent_mm + 0.5) * pixels - 0.5
-    margins = np.ascontiguousarray(np.broadcast_to(np.asarray(margin_mm, np.float64), tree.radius.shape))
+    margins = np.full(tree.radius.shape, margin_mm, np.float64)
     _draw(texels, tree.parent, tree.radius, pixels / extent_mm, margins, distance, radius)
     return distance, radius
 
