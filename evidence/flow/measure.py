@@ -43,8 +43,9 @@ def errors(flow: Map, pair: Pair) -> Errors:
     """Errors of one flow (H, W, 2) px. Lengths in px, NaN without such pixels.
 
     Returns:
-        Endpoint error: `mean` over visible pixels; `contact`, hidden points included; `contact_visible`,
-        without them; `hidden` under the tool. `magnitude`: mean error of |flow| relative to the mean |flow|;
+        Endpoint error: `mean` over visible pixels, and `still`, that of no flow; `contact`, hidden points
+        included; `contact_visible`, without them; `hidden` under the tool. `magnitude`: mean error of |flow|
+        relative to the mean |flow|;
         `divergence`: its RMS error relative to its RMS, `divergence_r`: its correlation with the true one,
         over visible pixels.
     """
@@ -54,6 +55,7 @@ def errors(flow: Map, pair: Pair) -> Errors:
     spread = float(np.sqrt(np.mean(true**2)))
     return {
         "mean": float(error[visible].mean()),
+        "still": float(real.mean()),
         "contact": _mean(error[pair.contact]),
         "contact_visible": _mean(error[pair.contact & visible]),
         "hidden": _mean(error[pair.hidden]),

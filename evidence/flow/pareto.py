@@ -75,9 +75,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
     shown = ("family", "setting", "default", "mean", "contact", "divergence", "cpu_s")
     rows = [{key: row[key] for key in shown} for row in found["rows"]]
     best = min(rows, key=lambda row: float(row["mean"]))
+    still = found["rows"][0]["still"]
     words = [
         f"**Least endpoint error: {best['family']}, {best['setting']}, {best['mean']:.3f} px in "
-        f"{best['cpu_s']:.3f} CPU-s.** Errors in px, of the divergence relative to its RMS; {found['on']}."
+        f"{best['cpu_s']:.3f} CPU-s; of no flow {still:.1f} px.** Errors in px, of the divergence relative "
+        f"to its RMS; {found['on']}."
     ]
     return report.Page("Flow: error against time", found, words, [report.Section("", rows)], chart)
 
