@@ -41,9 +41,7 @@ class Limits:
     farthest: float = 2.0  # limit of a change [local deviations]: pixels that are hidden count no more
     bins: int = 16  # of each channel of colours
     alike: float = 0.15  # share of the mean density of proven colours from which a colour is proven too
-    shared: float = (
-        0.7  # share of a region in proven colours from which it is tissue, though it tells nothing
-    )
+    shared: float = 0.7  # share of a region in proven colours from which it is tissue, if it tells nothing
     changed: float = 10.0  # grey levels from which a pixel of a frame differs from the aligned rest frame
     rim_px: int = 2  # half the width of differences that are rims of vessels
 
