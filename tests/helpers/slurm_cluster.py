@@ -85,6 +85,7 @@ def slurm_cluster(home: Path) -> Iterator[str]:
                     daemon.wait(timeout=20)
                 except subprocess.TimeoutExpired:
                     daemon.kill()
+                    daemon.wait(timeout=20)
 
 
 def _wait_for_node(daemons: list[subprocess.Popen[bytes]], home: Path) -> None:
