@@ -86,17 +86,17 @@ class Fusion:
 
         `motion_mm`: (T,) mean length of the flow; `stated`: as of `VideoEstimates`; `network`: its identity.
         """
-        self.video, self._reason = None, ""
-        self.is_calibrated = read_table().covers(network, scene.recovered_by)
+        self.video, self._reason, self.is_calibrated = None, "", False
         if self._alone or not fused:
             return list(fused)
+        table = read_table()
+        self.is_calibrated = table.covers(network, scene.recovered_by)
         by_network, by_physics = (
             np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
         )
         spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
         leading = np.array([estimate.force_mn for estimate in fused])
         self.video = VideoEstimates(leading, by_network, by_physics, spread, motion_mm, cameras, stated)
-        table = read_table()
         self._reason = table.find_reason(self.video, network, scene.recovered_by)
         if self._reason:
             return list(fused)
