@@ -296,16 +296,12 @@ def _fit_model(examples: Sequence[Example]) -> CameraModel:
     model = ErrorModel(model.intercept, tuple(slopes.tolist()), lowest, highest, model.least)
     count = sum(map(len, recordings.values()))
     # Without conformal prediction's correction for a new recording: of twenty it takes the largest error.
-    order, share = error / model.predict(features), frames
-    below, above = (max(_quantile(sign * order, share), 1e-3) for sign in (-1, 1))
+    shares = error / model.predict(features)
+    below, above = (
+        max(float(np.quantile(sign * shares, _SIDE, weights=frames, method="inverted_cdf")), 1e-3)
+        for sign in (-1, 1)
+    )
     return CameraModel(model, below, above, count, len(examples))
-
-
-def _quantile(values: Floats, weight: Floats) -> float:
-    """The value at which the weights reach `_SIDE`; the largest if they don't, with too few recordings."""
-    order = np.argsort(values)
-    reached = np.cumsum(weight[order]) >= _SIDE - 1e-9
-    return float(values[order][np.argmax(reached)] if reached.any() else values.max())
 
 
 def _judge(one: Example, table: IntervalTable) -> dict[str, float]:

@@ -199,23 +199,14 @@ def _epoch(
         solve(net, ((inputs(each, settings, scales), each.target / scales.target) for each in read))
     net.train(solve is None)
     total = torch.zeros((), device=frames.device)
+    constants = scales.target, scales.spread, scales.force / settings.grid.pitch_mm**2
     for i in range(batches):
         part = order[i * settings.batch : (i + 1) * settings.batch]
         batch = _augment(frames.batch(part), settings, epoch, i)
         with torch.set_grad_enabled(solve is None):
             predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
-        largest = scales.force / settings.grid.pitch_mm**2
-        error = loss(
-            predicted,
-            batch.target,
-            batch.mask,
-            settings.loss,
-            scales.target,
-            scales.spread,
-            largest,
-            progress,
-        )
+        error = loss(predicted, batch.target, batch.mask, settings.loss, *constants, progress)
         if i % CHECK_EVERY == 0:
             _finite(float(error.detach()), epoch)
         if solve is None:
@@ -301,9 +292,7 @@ def _gain(forces: Sequence[tuple[Floats, Floats]], anatomies: int) -> float:
     if anatomies < _GAIN_ANATOMIES or not ratios:
         return 1.0
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    order = np.argsort(ratio)
-    reached = np.cumsum(weight[order])
-    median = float(ratio[order][np.searchsorted(reached, reached[-1] / 2)])
+    median = float(np.quantile(ratio, 0.5, weights=weight, method="inverted_cdf"))
     return min(max(median, _GAINS[0]), _GAINS[1])
 
 
