@@ -28,7 +28,7 @@ class Limits:
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
-    held: float = 0.1  # share of an object on or next to what is segmented, above which it is one, found in part
+    held: float = 0.1  # share on or next to what is segmented, above which an object is part of that
     tip_px: int = 12  # what is next to it
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
