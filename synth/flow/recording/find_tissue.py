@@ -32,6 +32,7 @@ class Limits:
     wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
     sure: float = 0.7  # confidence above which a pixel is tracked
     visible: float = 0.7  # share of frames in which a pixel has to be tracked
+    seen: float = 0.3  # likewise to tell that a part which has the tissue's colours moves as well
     rounds: int = 5  # of GrabCut
     small: float = 0.05  # share of the picture below which what is found is not the tissue
     solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
@@ -89,10 +90,11 @@ class TissueSearch:
         visible = whole & (self._count > Limits.visible * self._frames)
         visible &= ~_morph(hidden, cv2.MORPH_DILATE, near)
         motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
-        moves = visible & (motion > Limits.moves * noise)
+        significant = motion > Limits.moves * noise
+        moves = visible & significant
         if moves.any():
-            moves &= motion > Limits.well * np.median(motion[moves])
-        moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
+            significant &= motion > Limits.well * np.median(motion[moves])
+        moves = _morph(_morph(visible & significant, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
         core = _morph(moves, cv2.MORPH_ERODE, near)
         if not core.any():
             return whole, _state("nothing moves by which to find it: the whole picture is assumed")
@@ -106,20 +108,24 @@ class TissueSearch:
             if is_alike:
                 text = "neither motion nor colour shows a rim: the whole picture is assumed"
                 return whole, _state(text, "warning")
+        # An instrument that is moved to and fro cuts tissue in parts, of which some are often hidden.
+        seen = whole & ~hidden & (self._count > Limits.seen * self._frames)
+        seeds = core | _morph(seen & significant, cv2.MORPH_OPEN, wide)
+        guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        held = _morph(expected & still & ~moves, cv2.MORPH_OPEN, 2)  # still, though tissue there would move
+        outside = still & ~_inner(whole)
+        tissue, solid = self._choose(colours, guess, core, seeds, hidden, outside)
+        if tissue[held].sum() > Limits.still * tissue.sum():  # it reaches too far
+            guess[held & ~core] = cv2.GC_BGD
+            other = self._choose(colours, guess, core, seeds, hidden, outside)
+            if other[1] > solid - Limits.less:
+                tissue, solid = other
+        text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
+        if not is_bounded and solid < Limits.solid:
             text, hull = "too little moves to find its rim: what moves is taken for it", whole & _hull(moves)
             if hull.mean() < Limits.small:
                 return hull, _refuse(f"what moves is {100 * hull.mean():.2g}% of the picture")
             return hull, _state(text, "warning")
-        guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
-        held = _morph(expected & still & ~moves, cv2.MORPH_OPEN, 2)  # still, though tissue there would move
-        outside = still & ~_inner(whole)
-        tissue, solid = self._choose(colours, guess, core, hidden, outside)
-        if tissue[held].sum() > Limits.still * tissue.sum():  # it reaches too far
-            guess[held & ~core] = cv2.GC_BGD
-            other = self._choose(colours, guess, core, hidden, outside)
-            if other[1] > solid - Limits.less:
-                tissue, solid = other
-        text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
         if tissue.mean() < Limits.small:
             return tissue, _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
         if solid < Limits.hollow:
@@ -130,18 +136,22 @@ class TissueSearch:
         return tissue, _state(text)
 
     def _choose(
-        self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask, outside: Mask
+        self, colours: Pixels, guess: Pixels, core: Mask, seeds: Mask, hidden: Mask, outside: Mask
     ) -> tuple[Mask, float]:
         """Of two regions, from a guess and from one by colour, the rounder one: from either, tissue may be
         lost that instruments cut off."""
         guesses = guess, _by_colour(guess, colours, core, outside)
-        return max((self._region(colours, one, core, hidden) for one in guesses), key=lambda one: one[1])
+        return max(
+            (self._region(colours, one, core, seeds, hidden) for one in guesses), key=lambda part: part[1]
+        )
 
-    def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
+    def _region(
+        self, colours: Pixels, guess: Pixels, core: Mask, seeds: Mask, hidden: Mask
+    ) -> tuple[Mask, float]:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
         near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
         tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
-        tissue = _largest(_with_hidden(tissue, core, hidden), core)
+        tissue = _largest(_with_hidden(tissue, seeds, hidden), core)
         tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
         hull = _hull(tissue)
         return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
@@ -219,10 +229,10 @@ def _morph(mask: Mask, how: int, radius: int) -> Mask:
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), how, disc) > 0)
 
 
-def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
-    """The mask with what instruments hide within the convex hull of its components that move."""
+def _with_hidden(mask: Mask, seeds: Mask, hidden: Mask) -> Mask:
+    """The mask with what instruments hide within the convex hull of its components that move (seeds)."""
     label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
-    parts = mask & np.isin(label, np.unique(label[core]))
+    parts = mask & np.isin(label, np.unique(label[seeds]))
     return parts | (_hull(parts) & hidden)
 
 
