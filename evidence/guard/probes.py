@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from learn.data.grid import Grid
 from learn.settings import preset
 from learn.split import Split
 from synth.arrays import Mask, Pixels
+from synth.dataset.store import Dataset
 from synth.fem import surface_embedding
 from synth.flow.segmentation import segment
 from synth.flow.stereo import stereo_track as stereo_track
@@ -38,6 +40,9 @@ Arrays = dict[str, Any]
 
 RECORDINGS = Path(__file__).with_name("recordings")
 """`mono` and `stereo`: recording folders of rendered sequences, made once by `store_recordings`."""
+
+SEQUENCES = Path(__file__).with_name("sequences.zip")
+"""Sequences of `tiny` without pictures; not the package's sample, which is rendered anew with the look."""
 
 _SMALL = ["sequences=1", "frames=4", "anatomy.vertices=1500", "fem.tets=400", "render.size=[64,48]"]
 _MECHANICS: dict[str, list[str]] = {
@@ -172,7 +177,7 @@ def probe_stereo() -> Arrays:
 def probe_network() -> Arrays:
     """Losses of four epochs by two loss functions, and the networks' answers, on clips of closed form.
 
-    Also what the package's own sequences are on a network's grid.
+    Also what stored sequences are on a network's grid.
     """
     from learn.training.train import train  # PyTorch is loaded by training alone
 
@@ -190,10 +195,12 @@ def probe_network() -> Arrays:
             history = [json.loads(line) for line in (out / "history.jsonl").read_text("utf-8").splitlines()]
             arrays[f"{loss}: losses"] = [epoch["loss"] for epoch in history]
             arrays[f"{loss}: answer"] = _answer(out)
-    for k, sequence in enumerate(synth.sample()):
-        clip = read_clip(sequence, Grid(32), ("ideal", "recovered"))
-        arrays[f"grid {k}: density"] = clip.density
-        arrays |= {f"grid {k}: {source}": moved for source, moved in clip.displacement.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.unpack_archive(SEQUENCES, folder)
+        for k, sequence in enumerate(Dataset(Path(folder))):
+            clip = read_clip(sequence, Grid(32), ("ideal", "recovered"))
+            arrays[f"grid {k}: density"] = clip.density
+            arrays |= {f"grid {k}: {source}": moved for source, moved in clip.displacement.items()}
     return arrays
 
 
