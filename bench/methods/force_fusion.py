@@ -91,6 +91,9 @@ class Fusion:
             return list(fused)
         table = read_table()
         self.is_calibrated = table.covers(network, scene.recovered_by)
+        if any(np.isnan(frame[self.parts[1]].low_mn) for frame in estimates):
+            self._reason = f"no interval: {self.parts[1]} states none"
+            return list(fused)
         by_network, by_physics = (
             np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
         )

@@ -125,7 +125,7 @@ class Physics:
         self._frames.append(observed)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
-        if frame.trusted and len(moved) == 3:
+        if frame.trusted:
             surface = large_motion.seen_motion(moved, spread, self._view.mask, GRID)
             last = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, last):
@@ -155,10 +155,11 @@ class Physics:
         else:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
-        self._gains = find_gains(self._scene, self._weights, self._large)
         strongest = max(self._frames, key=lambda frame: frame.signal_mm)
         if len(strongest.moved) == 2:
-            self._gains = find_monocular_gains(self._weights, strongest)
+            self._gains = find_monocular_gains(self._weights, strongest, bool(self._large))
+        else:
+            self._gains = find_gains(self._scene, self._weights, self._large)
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
 
@@ -182,9 +183,18 @@ class Physics:
         """What its result must not be taken for."""
         if self._scene is None or not self._gains.unsolved:
             return []
-        why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
         what = "the surface is bent beyond the range of the linear inverse"
+        if self._is_beyond:
+            return [f"{what}, with one camera and perhaps a membrane: forces may be many times larger"]
+        why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
         return [f"{what}, {why}: its largest forces are out of range, their intervals wide"]
+
+    @property
+    def _is_beyond(self) -> bool:
+        """Whether the error isn't bounded: with one camera forces of large motion were 3 to 100 times the
+        estimate where there is a membrane or may be one."""
+        may_be_covered = self._scene is not None and self._scene.membrane != "stripped"
+        return self._gains.unsolved > 0 and len(self._weights.own_mm) == 2 and may_be_covered
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
@@ -195,7 +205,7 @@ class Physics:
         answer = replace(linear, force=linear.force.times(factor), load=factor * linear.load)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
         low, high = size_interval(answer.force, gain, cameras)
-        low, high = low * least / factor, high * most / factor
+        low, high = (np.nan, np.nan) if self._is_beyond else (low * least / factor, high * most / factor)
         density = np.float32(young) * self._picture(answer) if picture else None
         likely = answer.force.times(young).with_gain(
             float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
@@ -374,13 +384,15 @@ def find_gains(
     return Gains(size_mn, low, high, unsolved)
 
 
-def find_monocular_gains(weights: TissueWeights, strongest: Observation) -> Gains:
-    """Gains with one camera, to which depth is hidden: what they may be where the linear force is large."""
+def find_monocular_gains(weights: TissueWeights, strongest: Observation, is_steep: bool) -> Gains:
+    """Gains with one camera, to which depth is hidden: what they may be where the linear force is large, or
+    motion across the view steep."""
     size = float(np.linalg.norm(infer(weights, strongest).force.mean))
-    if size <= TISSUES.linear:
+    if size <= TISSUES.linear and not is_steep:
         return NO_GAIN
     low, high = TISSUES.unsolved
-    return Gains(np.array([0.0, TISSUES.linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
+    linear = TISSUES.linear if size > TISSUES.linear else 0.5 * size
+    return Gains(np.array([0.0, linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
 
 
 @lru_cache(maxsize=1)

@@ -1,5 +1,8 @@
 """Fusion of network and physics, against closed forms of Gaussians and draws from stated errors."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +19,7 @@ CAUTION = 1.5  # factor of the network's stated deviation
 def estimate(forces: list[Floats], deviations: list[float], weights: list[float]) -> ForceEstimate:
     covariance = np.square(deviations)[:, None, None] * np.eye(3)
     mixture = ForceMixture(np.array(weights), np.array(forces), covariance)
-    return ForceEstimate(mixture.mean, likely=mixture)
+    return ForceEstimate(mixture.mean, low_mn=0.0, high_mn=20.0, likely=mixture)
 
 
 def fuse_one(network: ForceEstimate, physics: ForceEstimate) -> ForceEstimate:
@@ -53,3 +56,7 @@ def test_without_a_calibrated_network_there_is_no_interval_but_a_reason() -> Non
     assert np.isnan([one.high_mn for one in bound]).all()
     assert fusion.video is not None
     np.testing.assert_allclose(fusion.video.spread_mn, 0.01 * np.sqrt(3))
+    beyond = [{"network": o, "physics": replace(o, low_mn=math.nan, high_mn=math.nan)} for o in every]
+    bound = fusion.bound(fused, beyond, SCENE, 1, np.ones(3), 0.0, known)
+    assert fusion.video is None
+    assert np.isnan([one.high_mn for one in bound]).all()
