@@ -21,7 +21,7 @@ _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
 _SHADED = 0.75  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
-_GRAZING = 0.4  # rise of steel's reflectance at grazing angles, less what roughness takes
+_GRAZING = 12.0, 0.4  # rise of the reflectance of plastic and steel at grazing angles, less by roughness
 _TWICE = 1.7  # where light arrives that tissue has scattered before: a power of its colour
 
 
@@ -45,17 +45,18 @@ class Theatre:
         return np.stack(spread, axis=1)
 
 
-def glow(shape: Shape, alpha: Floats, theatre: Theatre) -> Floats:
+def glow(shape: Shape, alpha: Floats, bare: Floats, theatre: Theatre) -> Floats:
     """Radiance (V, 3) of the theatre, but for lamps, that mirrors at a shape's vertices show its lens.
 
-    `alpha`: (V,) GGX roughness of the mirrors.
+    `alpha`: (V,) GGX roughness of the mirrors; `bare`: (V,) share of them that is metal, else plastic.
     """
     normal = normals(shape)
     towards = theatre.lens - shape.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     seen = _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
-    return np.asarray(seen * (1 + _GRAZING * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
+    rise = np.interp(bare, (0, 1), _GRAZING)[:, None]
+    return np.asarray(seen * (1 + rise * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
 
 
 def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
