@@ -69,8 +69,8 @@ DEEP = Kind(
 
 
 TRIBUTARIES = (
-    Growth(spacing=6.5, reach=14.0, near=3.2, step=0.25, straight=1.5, end=(0.14, 0.24)),
-    Growth(spacing=3.2, reach=8.0, near=1.6, step=0.2, straight=1.0, end=(0.035, 0.07)),
+    Growth(spacing=6.0, reach=14.0, near=3.0, step=0.25, straight=1.5, end=(0.17, 0.32)),
+    Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
     Growth(spacing=3.0, reach=12.0, near=1.3, step=0.18, straight=1.6, end=(0.06, 0.08)),
@@ -79,7 +79,7 @@ ARTERIOLES = (
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
-_WIDE_MM = 0.18  # radius of such a vein
+_WIDE_MM = 0.22  # radius of such a vein
 _TWIG_MM = 0.35  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
