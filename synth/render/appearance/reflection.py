@@ -17,6 +17,7 @@ from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
 
 _DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.30, 0.31, 0.33])
+_PANELS = (0.4, 1.7, 2.9, 4.2, 5.3), 0.2, 1.5  # windows and light boxes: azimuths, half width [rad], radiance
 _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
@@ -73,5 +74,14 @@ def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Thea
     lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
     ground = lit * _SHADED * wound**_TWICE + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1)
-    above = (1 - high) * _DRAPE + high * _CEILING
+    above = (1 - high) * _DRAPE + high * _CEILING + _panels(direction, spread)[:, None]
     return np.asarray(below * ground + (1 - below) * above)
+
+
+def _panels(direction: Floats, spread: Floats) -> Floats:
+    """Radiance (N,) of light boxes on walls around directions (N, 3) of a standard deviation (N,) rad."""
+    turns, half, radiance = _PANELS
+    width = np.hypot(half, spread)
+    away = np.arctan2(direction[:, 1], direction[:, 0]) - np.array(turns)[:, None]
+    across = np.exp(-((np.angle(np.exp(1j * away)) / width) ** 2)).sum(axis=0) * half / width
+    return np.asarray(radiance * across * np.exp(-(((direction[:, 2] - 0.3) / np.hypot(0.4, spread)) ** 2)))
