@@ -30,7 +30,7 @@ _HOLLOW = 0.2  # depth of a blade's hollow, as a share of half its width
 _BLOOD_MM = 0.025  # height of a film of blood
 _LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
-_CHALK, _DULLED = 0.022, 1.2  # light that a handled coat scatters, and rise of its roughness
+_CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
 _SMEARED = 0.55, 30.0  # blood on coats: level of the noise from which it is smeared, to mm from the tip
 _SERRATION_MM = 0.5, 5.5, 0.38  # of forceps' inner faces: start, end, and period along the tip
 _BORE_RINGS = 5.2  # rings of a tube that are inside
@@ -180,7 +180,7 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
     handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
     scratch = step(lines - 1.6) * step(1.2 * mottle + 0.3)
-    pale = np.clip(1 + 0.1 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
+    pale = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
     painted = np.asarray(finish.coat, np.float32) * pale + _CHALK * (handled + scratch)[..., None]
     base = over(base, painted, coat[..., None])
     glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)

@@ -35,7 +35,8 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
     sigmas = tuple(mm / mm_per_px for mm in _TRAVELLED_MM)
     if spp >= _ENOUGH:
         picture = np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
-        return picture + _scattered(light.shade, light.arrive, cv2.merge([*light.blocked]), sigmas)
+        clear = cv2.merge([*(light.radiance - light.near + light.blocked)])
+        return picture + _scattered(light.shade, light.arrive, clear, sigmas)
     every = light.near, light.radiance - light.near, light.blocked
     near, behind, blocked = (cv2.merge([*part]) for part in every)
     cover, arrive, bare = light.cover, light.arrive, 1 - light.cover
