@@ -87,7 +87,7 @@ def _scattered(shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -
         blurred = cv2.GaussianBlur(small, (0, 0), 0.5 * sigma)
         part = blurred[..., 0] / np.maximum(blurred[..., 1], _LEAST)
         gained.append(sharp - cv2.resize(part, sharp.shape[::-1]))
-    return cv2.merge(gained) * clear
+    return np.asarray(cv2.merge(gained) * clear, np.float32)
 
 
 def _covered(near: Map, behind: Map, cover: Map, radius: Map) -> Map:
