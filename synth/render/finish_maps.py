@@ -30,6 +30,8 @@ _HOLLOW = 0.2  # depth of a blade's hollow, as a share of half its width
 _BLOOD_MM = 0.025  # height of a film of blood
 _LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
+_CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
+_SMEARED = 0.55, 30.0  # blood on coats: level of the noise from which it is smeared, to mm from the tip
 _SERRATION_MM = 0.5, 5.5, 0.38  # of forceps' inner faces: start, end, and period along the tip
 _BORE_RINGS = 5.2  # rings of a tube that are inside
 _DROPS = 1.2  # mean number of drops of water, per mm under water
@@ -175,10 +177,14 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
     base = np.asarray(finish.mirror, np.float32) * bright[..., None]
     base, bumps = _shaped(texels, coat, base, bumps)
-    painted = np.asarray(finish.coat, np.float32) * np.clip(1 + 0.05 * mottle + 0.08 * lines, 0, 2)[..., None]
+    # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
+    handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
+    scratch = step(lines - 1.6) * step(1.2 * mottle + 0.3)
+    pale = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
+    painted = np.asarray(finish.coat, np.float32) * pale + _CHALK * (handled + scratch)[..., None]
     base = over(base, painted, coat[..., None])
     glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
-    rough = over(rough, glossy, coat[..., None])
+    rough = over(rough, glossy * (1 + _DULLED * handled[..., None]), coat[..., None])
     bare = (1 - coat) * (1 - finish.scattered)
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
 
@@ -206,6 +212,9 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers) -> _Layers:
     share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven
     shown_to = step((1.3 * finish.blood_mm - texels.along) / 2) * (finish.blood > 0)
     deep = np.clip(share / 0.9 + 0.2, 0, 1.4) * shown_to
+    level, reach = _SMEARED
+    wiped = 0.6 * texels.blotch + 0.35 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
+    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, 0.9) * min(1, 3 * finish.blood) * (not texels.sheet))
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5)
     edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
     smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]

@@ -114,6 +114,11 @@ class InstrumentMesh:
         texels = np.sqrt(self.maps.rough[..., 0] * self.maps.rough[..., 1])
         return read_map(texels, self.uv).astype(np.float64)
 
+    @cached_property
+    def bare(self) -> Floats:
+        """(V,) share of bare metal at the vertices."""
+        return read_map(self.maps.bare, self.uv).astype(np.float64)
+
     @property
     def owner(self) -> Indices:
         sizes = [sum(len(part.profile) for part in one) for one in self.parts]
@@ -128,7 +133,7 @@ class InstrumentMesh:
         return Shape(np.concatenate([bar for one in each for bar in place(*one)]), self.faces)
 
     def glow(self, posed: Shape) -> Floats:
-        return reflection.glow(posed, self.alpha, self.theatre)
+        return reflection.glow(posed, self.alpha, self.bare, self.theatre)
 
     def touch(self, posed: Shape, surface: Floats) -> tuple[Floats, Floats]:
         near, away = _near(posed, surface)

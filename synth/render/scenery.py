@@ -42,7 +42,8 @@ def build_retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int, m
     maps = parts[0].maps(_DULL, "spatula", rng, mm_per_px)
     (vertices,) = instrument.place(parts, np.stack([tip, tip]), np.stack([shaft, shaft]))
     blade = Shape(vertices, parts[0].shape.faces)
-    steel = Metal(maps, reflection.glow(blade, np.full(len(vertices), _DULL.alpha), theatre))
+    alpha, bare = np.full(len(vertices), _DULL.alpha), np.ones(len(vertices))
+    steel = Metal(maps, reflection.glow(blade, alpha, bare, theatre))
     return Body(*blade, parts[0].uv, steel)
 
 
@@ -83,7 +84,8 @@ def build_clips(
         return []
     whole = joined(*shapes)
     uv, maps = stack_maps(textures)
-    glow = reflection.glow(whole, np.full(len(whole.vertices), 0.3), theatre)
+    alpha, bare = np.full(len(whole.vertices), 0.3), np.zeros(len(whole.vertices))
+    glow = reflection.glow(whole, alpha, bare, theatre)
     return [Body(*whole, uv, Metal(maps, glow))]
 
 

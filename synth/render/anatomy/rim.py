@@ -49,7 +49,7 @@ class CutEdge:
     height: tuple[float, ...] = (-1.7, -0.1, 0.08, 0.2, 0.27)  # of its rings over the brain
     painted: tuple[float, ...] = (-2.6, -1.1, -0.8, -0.5, -0.2)  # radii of its rings in the texture
     top: tuple[float, float] = 0.12, 0.3  # start of the dura's outer face: outwards, over the brain
-    albedo: Rgb = (0.88, 0.68, 0.62)  # of its section
+    albedo: Rgb = (0.9, 0.7, 0.58)  # of its section
     width: float = 0.3
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
@@ -74,7 +74,10 @@ class Dura:
         2.1,
         2.8,
     )  # height, waves per mm aside, reach of those at a stitch
-    soaked: tuple[float, float] = 1.6, 1.1  # its blood by the level, and by chance from place to place
+    soaked: tuple[float, float] = 1.6, 1.1  # its blood by the level, and by chance from place to place,
+    stained: tuple[float, float] = 0.75, 2.4  # more outwards, over what distance
+    vessels: tuple[float, float] = 0.055, 0.5  # width of its vessels in the noise, and their optical depth
+    thin: Rgb = (0.2, 0.7, 0.6)  # absorption where it is thin, and what is below shines through
 
 
 class Flap:
@@ -86,7 +89,7 @@ class Flap:
     long: tuple[float, float] = 0.35, 1.0  # rad, half of a flap's length
     ragged: float = 0.12  # spread of the dura's end, as cut by hand
     height: float = 0.16  # of the crease
-    albedo: Rgb = (0.85, 0.65, 0.57)  # of the inner face: smooth and pale
+    albedo: Rgb = (0.87, 0.66, 0.53)  # of the inner face: smooth and pale
     shadow: Rgb = (0.7, 1.0, 1.0)  # absorption beside the crease
     held: float = 0.7  # share of the stitches whose thread is seen
 
@@ -343,7 +346,9 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     turned = np.clip(start - 0.5, 0, 1)
     # Blood knows no crease: it thins over a millimetre.
     clean = step((0.35 * fibres + 0.25 * mottle - crease) / 1.6)
-    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * clean)
+    stained, far = Dura.stained
+    uneven = 0.8 * wide + 0.35 * mottle + 0.3 * fibres + 0.1 * outer - 0.7 * clean
+    soaked = _soaked(appearance.blood, uneven + stained * (np.clip(away / far, 0, 1.5) - 0.35))
     deepest, level = Blood.pool
     ragged = 0.12 * mottle + 0.1 * fibres + 0.04 * grain
     full = spilt + ragged + level * (3 * appearance.blood - 3.1) - 0.8 * clean
@@ -354,8 +359,11 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     bloody = (
         soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
     )
-    dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain, 0.04 * fine)
-    dura = over(dura, speckled(Flap.albedo, 0.03 * mottle, 0.03 * fibres), 0.75 * inner[..., None])
+    dura = speckled(appearance.dura_albedo, 0.08 * fibres, 0.06 * mottle, 0.02 * grain, 0.035 * fine)
+    dura = over(dura, speckled(Flap.albedo, 0.03 * mottle, 0.06 * fibres), 0.75 * inner[..., None])
+    dura = through(dura, np.clip(0.3 + 0.5 * spilt - 0.3 * fibres, 0, 0.8), Dura.thin)
+    width, depth = Dura.vessels
+    dura = through(dura, depth * ridge(mottle + 0.4 * wide, width) * step(0.5 + 0.6 * spilt), Wound.blood)
     section = np.clip(0.6 + 0.3 * wide + 0.2 * mottle, 0, 0.85) * ridge(away, width=CutEdge.width)
     dura = through(dura, bloody * (1 - 0.7 * section), Wound.blood)
     dura = through(dura, turned * step(crease / 0.1) * np.exp(-np.abs(crease) / 0.35), Flap.shadow)
@@ -380,13 +388,14 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         colour, gutter + 0.5 * ridge(away - reach, width=0.4) - 1.5 * np.minimum(folds, 0), Wound.shadow
     )
     wet = np.maximum(pool, drops) * (1 - skin)
-    rough = 0.006 * grain + outer * (0.003 * fine + 0.02 * bundles)
-    bumps = (folds + 0.025 * mottle + rough) * (1 - 0.75 * wet) + 0.06 * wet
+    rough = 0.008 * grain + 0.0015 * fine + outer * (0.0015 * fine + 0.02 * bundles)
+    bumps = (folds + over(0.016 * mottle + 0.014 * fibres, 0.025 * mottle, outer) + rough) * (1 - 0.75 * wet)
+    bumps = bumps + 0.06 * wet
     bumps = bumps + Flap.height * turned * (
         step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
     )
     dry = np.clip(
-        0.6 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner,
+        0.5 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner,
         0.02,
         1,
     )

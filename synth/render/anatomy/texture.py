@@ -72,7 +72,7 @@ class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
     absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
-    opaque: tuple[float, float] = 0.28, 0.14  # depth that even fine ones reach, and the chord for 63% of it
+    opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.74, 0.16, 0.085)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
@@ -108,7 +108,10 @@ class Film:
     reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.17  # standard deviation of slopes where the film is thin
-    level: float = 0.5  # share of the pia's slope that a pool takes away
+    level: float = 0.15  # share of the pia's slope that a pool takes away,
+    filled: float = 0.6  # and of the relief under it
+    ripples: float = 0.055  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
+    ripples_mm: float = 0.22  # blur that makes them
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
@@ -341,7 +344,8 @@ def _film(
     dry = np.minimum(dry, 1 - pools)
     swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.2 * pools)
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
-    relief = relief * (1 - 0.97 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
+    pooled = cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)
+    relief = relief * (1 - Film.filled * pooled) + veins
     # A vein's wall is smooth, and its film thin: its crest mirrors the lamp in one broad line.
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
     height = relief + appearance.bump * (1 - 0.9 * on_vein) * swell
@@ -351,7 +355,9 @@ def _film(
     height = height + (Film.rough * extent / len(sulci)) * rough * fine
     start, span = Vein.wide
     wide = on_vein * np.clip((radius - start) / span, 0, 1)
-    height = height + wide * _waves(tile, extent, len(sulci))
+    height = height + wide * _waves(tile, Vein.waves, Vein.waves_mm, extent, len(sulci))
+    ripples = _waves(tile.T, Film.ripples, Film.ripples_mm, extent, len(sulci))
+    height = height + pooled * (1 - on_vein) * ripples
     bare, wide = (
         cv2.resize(share, (coarse, coarse), interpolation=cv2.INTER_AREA) for share in (on_vein, wide)
     )
@@ -360,11 +366,11 @@ def _film(
     return np.asarray(height, np.float32), np.asarray(np.clip(dry, 0, 1), np.float32), pools, wide
 
 
-def _waves(tile: Map, extent: float, pixels: int) -> Map:
-    """Heights (n, n) mm of the waves of veins' walls, from a map of white noise that repeats."""
-    sigma = Vein.waves_mm * pixels / extent
+def _waves(tile: Map, slope: float, blur_mm: float, extent: float, pixels: int) -> Map:
+    """Heights (n, n) mm of waves with slopes of a standard deviation: white noise that repeats, blurred."""
+    sigma = blur_mm * pixels / extent
     smooth = cv2.GaussianBlur(np.pad(tile, 64, mode="wrap"), (0, 0), sigma)[64:-64, 64:-64]
-    high = Vein.waves * Vein.waves_mm * 2**0.5 / float(smooth.std()) * smooth
+    high = slope * blur_mm * 2**0.5 / float(smooth.std()) * smooth
     return np.tile(high, (pixels // _TILE + 1,) * 2)[:pixels, :pixels]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -70,28 +69,26 @@ DEEP = Kind(
 
 
 TRIBUTARIES = (
-    Growth(spacing=6.5, reach=14.0, near=3.2, step=0.25, straight=1.5, end=(0.14, 0.24)),
-    Growth(spacing=3.2, reach=8.0, near=1.6, step=0.2, straight=1.0, end=(0.035, 0.07)),
+    Growth(spacing=6.0, reach=14.0, near=3.0, step=0.25, straight=1.5, end=(0.17, 0.32)),
+    Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=2.6, reach=7.0, near=1.2, step=0.16, straight=1.4, end=(0.045, 0.065)),
-    Growth(spacing=1.0, reach=2.8, near=0.5, step=0.12, straight=1.2, end=(0.028, 0.04)),
-    Growth(spacing=0.48, reach=1.4, near=0.27, step=0.1, straight=1.0, end=(0.022, 0.029)),
+    Growth(spacing=3.0, reach=12.0, near=1.3, step=0.18, straight=1.6, end=(0.06, 0.08)),
+    Growth(spacing=1.15, reach=4.0, near=0.42, step=0.12, straight=1.3, end=(0.036, 0.046)),
+    Growth(spacing=0.6, reach=1.6, near=0.22, step=0.1, straight=1.0, end=(0.025, 0.031)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
-_WIDE_MM = 0.18  # radius of such a vein
-_RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
-_ENTERS = 0.8  # depth of a sulcus, 0 to 1, from which a trunk may come into sight
-_BEHIND_MM = 0.8  # a trunk that starts nearer to what hides its start than this is not led on
-_LED_MM = 0.16  # spacing of the points by which it is led on
-_TWIG_MM = 0.6  # shorter side branches are left out: they look like thorns
+_WIDE_MM = 0.22  # radius of such a vein
+_TWIG_MM = 0.35  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
-_TAPER_MM = 0.45  # length over which arterioles and tributaries thin
-_POINTED = 0.02, 0.09  # radius of a free end, and by how much it grows with each mm from there
+_TAPER_MM = 0.3  # length over which arterioles and tributaries thin
+_POINTED = 0.02, 0.12  # radius of a free end, and by how much it grows with each mm from there
 _WIDENS = 1.05  # times, at most and besides, from a node to the next one up
-_WINDING = 0.045, 1.2  # shift of fine vessels, and over what distance
+_WINDING = 0.1, 1.5  # shift of fine vessels, and over what distance
+_BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
+_SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
 
 
 @dataclass(frozen=True)
@@ -119,19 +116,15 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     visible = smooth
     for growth in TRIBUTARIES:
         visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
-    visible = _finished(visible, len(smooth.nodes), extent_mm, rng)
+    visible = _finished(visible, len(smooth.nodes), 0.0, extent_mm, rng)
     distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
     beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
-    free = (~beside * np.clip(0.9 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.35, 1)).astype(
-        np.float32
-    )
-    main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 1.0))
-    hidden = beside | (cv2.resize(sulci, beside.shape) > _ENTERS)
-    arteries = main = _led_in(main, hidden, extent_mm, rng)
+    free = (~beside * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)).astype(np.float32)
+    arteries = main = _slender(_smooth(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm), 1.3))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
-    arteries = _finished(_without_thorns(arteries), len(main.nodes), extent_mm, rng)
-    return Vessels(veins, trunks, visible, arteries, _with_risers(deep, main, extent_mm))
+    arteries = _finished(_without_thorns(arteries), len(main.nodes), _BENT[0], extent_mm, rng)
+    return Vessels(veins, trunks, visible, arteries, deep)
 
 
 def _targets(growth: Growth, density: Map, extent_mm: float, rng: np.random.Generator) -> Floats:
@@ -142,7 +135,17 @@ def _targets(growth: Growth, density: Map, extent_mm: float, rng: np.random.Gene
 
 def _pruned(tree: Tree, least_mm: float) -> Tree:
     """The tree without twigs of a radius below `least_mm`."""
-    kept = gather(tree.parent, (tree.radius >= least_mm).astype(np.float64)) > 0
+    return _parts(tree, gather(tree.parent, (tree.radius >= least_mm).astype(np.float64)) > 0)
+
+
+def _from_outside(tree: Tree, extent_mm: float) -> Tree:
+    """The trunks that enter at the patch's border, or all: a start in mid-field looks like a spindle."""
+    kept = ~_inside(tree, extent_mm)[_trunk_of(tree)]
+    return _parts(tree, kept) if kept.any() else tree
+
+
+def _parts(tree: Tree, kept: Mask) -> Tree:
+    """The tree of the nodes (N,) that are kept, which includes the parent of each."""
     number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
     return Tree(tree.nodes[kept], number[tree.parent[kept]], tree.radius[kept])
 
@@ -162,56 +165,6 @@ def _slender(tree: Tree) -> Tree:
     return Tree(tree.nodes, tree.parent, tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5)
 
 
-def _led_in(tree: Tree, hidden: Mask, extent_mm: float, rng: np.random.Generator) -> Tree:
-    """The tree whose trunks that start in mid-field are led on backwards to where their start is hidden.
-
-    `hidden`: (m, m) clefts and wide veins; the patch's border and wider trunks of other trees hide it too.
-    """
-    screens, near = _screens(hidden, extent_mm), cKDTree(tree.nodes)
-    trunk = _trunk_of(tree)
-    paths, radii, ends = list[Floats](), list[Floats](), list[int]()
-    for root in np.flatnonzero((tree.parent < 0) & _inside(tree, extent_mm)):
-        start = tree.nodes[root]
-        around = np.array(near.query_ball_point(start, 2.0))
-        around = around[trunk[around] == root]
-        wide, ahead = float(tree.radius[around].max()), (tree.nodes[around] - start).mean(axis=0)
-        ahead /= max(float(np.linalg.norm(ahead)), 0.2)
-        goals = np.concatenate([screens, tree.nodes[(trunk != root) & (tree.radius > wide)]])
-        away = np.hypot(*(goals - start).T)
-        if away.min() < _BEHIND_MM:  # it comes up there
-            risen = 0.15 + np.hypot(*(tree.nodes[around] - start).T) / (0.5 * _RISE_MM)
-            tree.radius[around] *= np.clip(risen, 0, 1)
-            continue
-        nearest = np.argmin(away * (1.4 + (goals - start) @ ahead / away))
-        long, goal = float(away[nearest]), goals[nearest]
-        part = np.linspace(0, 1, max(4, round(long / _LED_MM)))[:-1, None]
-        bend = start - 0.45 * long * ahead + rng.normal(0, 0.08 * long, 2)
-        paths.append((1 - part) ** 2 * goal + 2 * part * (1 - part) * bend + part**2 * start)
-        radii.append(wide * np.clip(0.05 + part[:, 0] * max(1, long / _RISE_MM), 0, 1) ** 0.7)
-        ends.append(int(root))
-    sizes = np.array([len(path) for path in paths], np.int64)
-    count = int(sizes.sum())
-    before = np.arange(-1, count - 1)
-    before[np.cumsum(sizes) - sizes] = -1
-    parent = np.where(tree.parent >= 0, tree.parent + count, -1)
-    parent[ends] = np.cumsum(sizes) - 1
-    made = Tree(
-        np.concatenate([*paths, tree.nodes]),
-        np.concatenate([before, parent]),
-        np.concatenate([*radii, tree.radius]),
-    )
-    return _smooth(made, 0.5)
-
-
-def _screens(hidden: Mask, extent_mm: float) -> Floats:
-    """Points (N, 2) mm of a mask (m, m), coarsely, and of the patch's border."""
-    row, column = np.nonzero(hidden[::8, ::8])
-    clefts = (np.column_stack([column, row]) * 8 + 0.5) * (extent_mm / len(hidden)) - extent_mm / 2
-    side, far = np.linspace(-0.46, 0.46, 32) * extent_mm, np.full(32, 0.46 * extent_mm)
-    ways = (side, far), (side, -far), (far, side), (-far, side)
-    return np.concatenate([clefts, *(np.column_stack(way) for way in ways)])
-
-
 def _without_thorns(tree: Tree) -> Tree:
     """The tree without side branches shorter than `_TWIG_MM`."""
     left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
@@ -222,13 +175,7 @@ def _without_thorns(tree: Tree) -> Tree:
     gone = (tree.parent >= 0) & (left < _TWIG_MM) & (left < longest[tree.parent])
     for _ in range(round(_TWIG_MM / 0.05)):
         gone |= gone[tree.parent] & (tree.parent >= 0)
-    number = np.append(np.where(gone, -1, np.cumsum(~gone) - 1), -1)
-    return Tree(tree.nodes[~gone], number[tree.parent[~gone]], tree.radius[~gone])
-
-
-def _roots_inside(tree: Tree, extent_mm: float) -> Floats:
-    """Roots (n, 2) mm that are not at the patch's border."""
-    return np.asarray(tree.nodes[(tree.parent < 0) & _inside(tree, extent_mm)])
+    return _parts(tree, ~gone)
 
 
 def _inside(tree: Tree, extent_mm: float) -> Mask:
@@ -236,32 +183,15 @@ def _inside(tree: Tree, extent_mm: float) -> Mask:
     return np.asarray(np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)
 
 
-def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:
-    """The vessels below the pia with those by which trunks come up inside the patch, behind their roots."""
-    nodes, parent, radius = [deep.nodes], [deep.parent], [deep.radius]
-    count, tree = len(deep.nodes), cKDTree(main.nodes)
-    steps = np.arange(0.0, 2 * _RISE_MM, 0.2)
-    for root in _roots_inside(main, extent_mm):
-        near = np.array(tree.query_ball_point(root, 2.0))
-        ahead = (main.nodes[near] - root).mean(axis=0)
-        size = float(np.linalg.norm(ahead))
-        if size < 0.2:  # it branches at once to all sides: it comes straight up
-            continue
-        nodes.append(root + (2.0 - steps[:, None]) * ahead / size)
-        parent.append(np.append(-1, count + np.arange(len(steps) - 1)))
-        radius.append(main.radius[near].max() * np.sqrt(1 - steps / (2 * _RISE_MM)))
-        count += len(steps)
-    return Tree(np.concatenate(nodes), np.concatenate(parent), np.concatenate(radius))
-
-
-def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator) -> Tree:
-    """The tree whose nodes from number `main` on have grown in, made to wind, and thinned to their ends."""
+def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.random.Generator) -> Tree:
+    """The tree whose nodes from number `main` on have grown in, made to wind and bend, and thinned."""
     nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, _ROUNDED)
     shift, wave = _WINDING
-    winding = np.stack(
-        [noise.sample(noise.band(rng, 256, extent_mm, wave, 0.5), nodes, extent_mm) for _ in range(2)], 1
+    winding, bends = (
+        np.stack([noise.sample(noise.band(rng, 256, extent_mm, w, 0.5), nodes, extent_mm) for _ in "xy"], 1)
+        for w in (wave, _BENT[1])
     )
-    supple = shift / (1 + (tree.radius / 0.06) ** 2)
+    supple = shift / (1 + (tree.radius / _SUPPLE_MM) ** 2)
     left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
     thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
@@ -270,7 +200,7 @@ def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator)
     )
     wide = np.clip(tree.radius / 0.3, 0, 1)
     radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
-    return _pointed(Tree(nodes + supple[:, None] * winding, tree.parent, radius), extent_mm)
+    return _pointed(Tree(nodes + supple[:, None] * winding + bent * bends, tree.parent, radius), extent_mm)
 
 
 def _pointed(tree: Tree, extent_mm: float) -> Tree:

@@ -17,11 +17,12 @@ from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
 
 _DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.30, 0.31, 0.33])
+_PANELS = (0.4, 1.7, 2.9, 4.2, 5.3), 0.2, 1.5  # windows and light boxes: azimuths, half width [rad], radiance
 _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
 _SHADED = 0.75  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
-_GRAZING = 0.4  # rise of steel's reflectance at grazing angles, less what roughness takes
+_GRAZING = 12.0, 0.4  # rise of the reflectance of plastic and steel at grazing angles, less by roughness
 _TWICE = 1.7  # where light arrives that tissue has scattered before: a power of its colour
 
 
@@ -45,17 +46,18 @@ class Theatre:
         return np.stack(spread, axis=1)
 
 
-def glow(shape: Shape, alpha: Floats, theatre: Theatre) -> Floats:
+def glow(shape: Shape, alpha: Floats, bare: Floats, theatre: Theatre) -> Floats:
     """Radiance (V, 3) of the theatre, but for lamps, that mirrors at a shape's vertices show its lens.
 
-    `alpha`: (V,) GGX roughness of the mirrors.
+    `alpha`: (V,) GGX roughness of the mirrors; `bare`: (V,) share of them that is metal, else plastic.
     """
     normal = normals(shape)
     towards = theatre.lens - shape.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     seen = _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
-    return np.asarray(seen * (1 + _GRAZING * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
+    rise = np.interp(bare, (0, 1), _GRAZING)[:, None]
+    return np.asarray(seen * (1 + rise * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
 
 
 def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
@@ -72,5 +74,14 @@ def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Thea
     lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
     ground = lit * _SHADED * wound**_TWICE + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1)
-    above = (1 - high) * _DRAPE + high * _CEILING
+    above = (1 - high) * _DRAPE + high * _CEILING + _panels(direction, spread)[:, None]
     return np.asarray(below * ground + (1 - below) * above)
+
+
+def _panels(direction: Floats, spread: Floats) -> Floats:
+    """Radiance (N,) of light boxes on walls around directions (N, 3) of a standard deviation (N,) rad."""
+    turns, half, radiance = _PANELS
+    width = np.hypot(half, spread)
+    away = np.arctan2(direction[:, 1], direction[:, 0]) - np.array(turns)[:, None]
+    across = np.exp(-((np.angle(np.exp(1j * away)) / width) ** 2)).sum(axis=0) * half / width
+    return np.asarray(radiance * across * np.exp(-(((direction[:, 2] - 0.3) / np.hypot(0.4, spread)) ** 2)))

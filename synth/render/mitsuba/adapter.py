@@ -96,6 +96,7 @@ class Stage:
         scene |= {name: _mesh(mi, name, body) for name, body in bodies.items()}
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
+        self._mm_per_px = camera.mm_per_px
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
@@ -120,7 +121,7 @@ class Stage:
         lens = self._lens
         if self._layered:
             light = trace(self._scene, lens.sensor, self._size, "metal", lens.spp, seed)
-            radiance = soften(light, lens.spp)
+            radiance = soften(light, lens.spp, self._mm_per_px)
         else:
             import mitsuba as mi
 

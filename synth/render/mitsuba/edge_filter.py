@@ -1,4 +1,5 @@
-"""Denoising of soft edges: defocused objects and shadows are averaged along their own edges.
+"""Denoising of soft edges: defocused objects and shadows are averaged along their own edges; and the light
+that tissue scatters across a shadow's edge.
 
 A few paths per pixel locate a soft edge only roughly, but along it little changes, and nothing within a small
 part of the circle of confusion. So what covers a pixel is averaged over these, while the background behind it
@@ -23,12 +24,19 @@ _ENOUGH = 16  # paths per pixel from which on nothing is filtered
 _SIGMA_PX = 1.5  # of the smoothing before and after slopes are taken
 _FLAT = np.float32(1e-4)  # squared slope per pixel below which there is no edge
 _LEAST = np.float32(1e-6)
+_TRAVELLED_MM = 0.45, 0.18, 0.15  # by light in tissue, farthest in red: standard deviations, by eye
 
 
-def soften(light: Light, spp: int) -> Map:
-    """Radiance (H, W, 3) of `direct_light.trace` of `spp` paths per pixel with its soft edges denoised."""
+def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
+    """Radiance (H, W, 3) of `direct_light.trace` of `spp` paths per pixel with its soft edges denoised.
+
+    `mm_per_px`: of tissue, which scatters light into shadows; none if infinite.
+    """
+    sigmas = tuple(mm / mm_per_px for mm in _TRAVELLED_MM)
     if spp >= _ENOUGH:
-        return np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
+        picture = np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
+        clear = cv2.merge([*(light.radiance - light.near + light.blocked)])
+        return picture + _scattered(light.shade, light.arrive, clear, sigmas)
     every = light.near, light.radiance - light.near, light.blocked
     near, behind, blocked = (cv2.merge([*part]) for part in every)
     cover, arrive, bare = light.cover, light.arrive, 1 - light.cover
@@ -50,7 +58,8 @@ def soften(light: Light, spp: int) -> Map:
         # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
         most = np.minimum(4 * total * arrive / np.maximum(dull * bright, _LEAST), 1)
         gain = most * (light.shade / np.maximum(arrive, _LEAST) - shade / np.maximum(total, _LEAST))
-        behind = np.maximum(behind + gain[..., None] * clear, 0)
+        scattered = _scattered(shade, total, most[..., None] * clear, sigmas)
+        behind = np.maximum(behind + gain[..., None] * clear + scattered, 0)
     picture = np.ascontiguousarray(near + behind)
     if cover.any():
         reach = int((light.radius / np.maximum(cover, _LEAST)).max()) + _REACH
@@ -60,6 +69,25 @@ def soften(light: Light, spp: int) -> Map:
         radius = cv2.blur(light.radius, (2 * reach + 1,) * 2)[at] / np.maximum(share[at], _LEAST)
         picture[at] = _covered(near[at], behind[at], cover[at], radius)
     return picture
+
+
+def _scattered(shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -> Map:
+    """Radiance (H, W, 3) that shadows gain, or light beside them loses, by the blur of irradiance in tissue.
+
+    `shade` of the irradiance `arrive` (H, W) is blocked; without it the radiance is `clear` (H, W, 3);
+    `sigmas`: of the blur in each channel, px.
+    """
+    if not any(sigmas):
+        return np.zeros_like(clear)
+    both = cv2.merge([shade, arrive])
+    small = cv2.resize(both, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    sharp = shade / np.maximum(arrive, _LEAST)
+    gained = []
+    for sigma in sigmas:
+        blurred = cv2.GaussianBlur(small, (0, 0), 0.5 * sigma)
+        part = blurred[..., 0] / np.maximum(blurred[..., 1], _LEAST)
+        gained.append(sharp - cv2.resize(part, sharp.shape[::-1]))
+    return np.asarray(cv2.merge(gained) * clear, np.float32)
 
 
 def _covered(near: Map, behind: Map, cover: Map, radius: Map) -> Map:

@@ -184,7 +184,7 @@ def test_a_mirror_over_tissue_shows_its_colour_below_and_the_dark_theatre_above(
         x, y = np.array([np.cos(t), 0.0, -np.sin(t)]), np.array([0.0, 1.0, 0.0])
         assert np.cross(x, y) @ lens == pytest.approx(np.cos(t))
         level = Shape(np.stack([0 * x, x, y]) + np.array([0, 0, 3.0]), np.array([[0, 1, 2]], np.int32))
-        shown.append(glow(level, np.full(3, 0.1), red)[0])
+        shown.append(glow(level, np.full(3, 0.1), np.ones(3), red)[0])
     above, below = shown
     assert below[0] > 2 * below[1] > 0
     assert below[0] > above[0]
