@@ -116,7 +116,7 @@ def check_edges(sensor: SensorMotion) -> list[Finding]:
                 f"contacts begin and end {abs(offset_s):.2f} s {'later' if offset_s > 0 else 'earlier'} in "
             )
             what += f"the video than in the sensor's record: add {offset_s:+.2f} s (sync.offset_s)"
-    elif lost_s[k] > max(2 * frame_s, 2 * _EDGE_S) and late_s[2 * k + 1] < -frame_s:
+    elif lost_s[k] > max(2 * frame_s, 2 * _EDGE_S) and late_s[2 * k] < max(0.5 * frame_s, 0.5 * _EDGE_S):
         what = f"a contact ends {lost_s[k]:.2f} s earlier in the video than in the sensor's record: are "
         what += f"pictures missing between {moved[2 * k]:.2f} and {moved[2 * k + 1]:.2f} s?"
     return [Finding("warning", "clocks", what)] if what else []
@@ -126,12 +126,19 @@ def check_unsensed(sensor: SensorMotion) -> list[Finding]:
     """The finding on a force in the video while the sensor measures none."""
     if sensor.bounds_mn is None or sensor.leading_mn is None:
         return []
-    most_mn = max(float(sensor.size_mn.max()), float(np.linalg.norm(sensor.leading_mn, axis=1).max()))
+    # Without spikes, which are no peak.
+    top_mn = float(np.percentile(sensor.size_mn, _TOP))
+    most_mn = max(top_mn, float(np.linalg.norm(sensor.leading_mn, axis=1).max()))
+    contact_mn = 0.05 * top_mn
+    at_rest_mn = 0.0 if sensor.rest_mn is None else float(np.linalg.norm(sensor.rest_mn))
+    if max(3 * sensor.noise_mn, at_rest_mn) > contact_mn:  # the tare is wrong, or the rest frame is
+        return []
     low = np.nan_to_num(sensor.bounds_mn[:, 0])
-    alone = (sensor.size_mn < sensor.contact_mn) & (low > _UNSENSED * most_mn)
+    alone = (sensor.size_mn < contact_mn) & (low > _UNSENSED * most_mn)
     runs = np.split(np.arange(len(alone)), np.flatnonzero(np.diff(alone)) + 1)
     run = max((run for run in runs if alone[run[0]]), key=len, default=np.zeros(0, int))
-    if len(run) < 2:
+    # What isn't released within the video may be the camera's motion.
+    if len(run) < 2 or low[run[0] :].min() > _UNSENSED * most_mn:
         return []
     what = (
         f"from {sensor.time_s[run[0]]:.2f} to {sensor.time_s[run[-1]]:.2f} s the video shows a force of at "
@@ -167,7 +174,7 @@ def _check_hypotheses(sensor: SensorMotion) -> list[Finding]:
     close = [one.hypothesis for one in likely if one.odds > best.odds - _ALIKE]
     names = dict[str, str]()  # the best of each cause
     for one in close:
-        names.setdefault(one.message if one.turns else one.cause, one.message)
+        names.setdefault(one.message.split(":")[0] if one.turns else one.cause, one.message)
     start = missed or "sensor and video contradict each other"
     # Only what several methods agree on is certain: one may be wrong itself.
     sure = missed and best.odds > _SURE and len(sensor.forces_mn) > 1
@@ -317,7 +324,7 @@ def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:
         if tool := set(signs) == {-1} and order == tuple(range(axes)):
             what = "the sign: force.csv holds the force on the tool (sensor.acts_on)"
         elif order == tuple(range(axes)) and signs.count(-1) == 1:
-            what += ": a mirrored picture?"
+            what = f"a mirrored picture: the camera's axes are {names} of force.csv"
         turned = force.copy()
         turned[:, :axes] = force[:, list(order)] * signs
         yield Hypothesis(

@@ -257,7 +257,7 @@ def find_sensor_motion(
 def check_drift(sensor: SensorMotion) -> list[Finding]:
     """Findings on a zero that drifts: the sensor's force changes between spans with the tissue at rest."""
     drift = sensor.drift
-    if drift is None or not drift.is_clear:
+    if drift is None or not drift.is_clear or check_constant(sensor):
         return []
     first_s, last_s = drift.time_s[0], drift.time_s[-1]
     message = (

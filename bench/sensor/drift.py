@@ -52,7 +52,13 @@ def find_drift(
         share, sample_s = _SHORT_SHARE, samples[0]
         ends = [t[span][[0, -1]] for span in find_rest_spans(t, motion, short=True)]
         inside = [(sample_s >= a) & (sample_s <= b) & np.isfinite(samples[1]).all(axis=1) for a, b in ends]
-        inside = [part for part in inside if part.sum() >= _SAMPLES]
+        most = float(np.linalg.norm(axes, axis=1).max())
+        # A force that changes there is a load: the clocks are apart, or the video misses it.
+        inside = [
+            part
+            for part in inside
+            if part.sum() >= _SAMPLES and _change(samples[1][part]) < 0.25 * _SHORT_SHARE * most
+        ]
         values, middles = (
             [samples[1][part] for part in inside],
             [float(sample_s[part].mean()) for part in inside],
@@ -65,6 +71,12 @@ def find_drift(
     most = float(np.linalg.norm(axes - zero[0], axis=1).max())
     is_clear = change > max(_SIGMAS * noise, share * most)
     return Drift(np.array(middles), zero, change, noise, is_clear)
+
+
+def _change(values: Floats) -> float:
+    """Change of the median of a force (N, 3) from one half to the other."""
+    first, second = np.array_split(values, 2)
+    return float(np.linalg.norm(np.median(second, axis=0) - np.median(first, axis=0)))
 
 
 def find_rest_spans(time_s: Floats, moved: Floats, short: bool = False) -> list[Mask]:
