@@ -87,7 +87,7 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
     if sensor.pulsates or any(finding.cause == "clocks" for finding in found):
         return found
     edges = check_edges(sensor)
-    return found + (edges or check_unsensed(sensor))
+    return found + (edges or ([] if found else check_unsensed(sensor)))
 
 
 def check_edges(sensor: SensorMotion) -> list[Finding]:

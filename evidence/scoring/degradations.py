@@ -248,7 +248,7 @@ def _blur(rgb: Picture) -> Any:
 
 
 _COARSE, _AGAIN, _LIGHT = "^pictures: .*(detail|compressed)", "again", "^pictures: .*light"
-_MISSING, _LATE = r"^pictures: .*missing|^clocks|^times", "^stereo: .*(late|early)"
+_MISSING, _LATE = "^(pictures|stereo): .*missing|^clocks|^times", "^stereo: .*(late|early)"
 _UNMASKED = "^(tool|foreground): .*masks"
 _BROKEN = "damaged|cut off|cannot be read|unreadable|not readable"
 _PAIR = {"calibration": "stereo.yaml", "mm_per_unit": 2}
@@ -266,7 +266,7 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "a hand comes into view": (_later(lambda rgb: _cover(rgb, (222, 202, 180), 0.3, 0.7)), "^foreground"),
     "letterbox": (_each(lambda rgb, k: np.pad(rgb[20:-20], ((20, 20), (0, 0), (0, 0)))), "bars"),
     "interlaced": (_interlace, "interlaced"),
-    "mirrored": (_mirror, "mirrored picture"),
+    "mirrored": (_mirror, "mirrored"),
     "H.264 at crf 51": (_compress, _COARSE),
     "focus lost later": (_later(_blur, 9), "sharp"),
     "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "^(scale|force)"),

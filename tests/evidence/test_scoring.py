@@ -122,9 +122,14 @@ def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
 
 def test_each_degradation_changes_a_recording(tmp_path: Path) -> None:
     source = Maker(tmp_path)(frames=degradations.FRAMES, meta={"membrane": "stripped"})
-    (source / "right").mkdir()
-    for file in (source / "frames").iterdir():
-        cv2.imwrite(str(source / "right" / file.name), cv2.imread(str(file))[:, ::-1])
+    for part in ("right", "masks"):
+        (source / part).mkdir(exist_ok=True)
+    for k, file in enumerate(sorted((source / "frames").iterdir())):
+        picture = cv2.imread(str(file))
+        cv2.imwrite(str(source / "right" / file.name), picture[:, ::-1])
+        mask = np.zeros(picture.shape[:2], np.uint8)
+        mask[:, 2 * k : 2 * k + 10] = 255
+        cv2.imwrite(str(source / "masks" / f"{k:06d}.png"), mask)
     meta = degradations.read_meta(source)
     recording_writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
 
