@@ -52,7 +52,7 @@ def find_drift(
         share, sample_s = _SHORT_SHARE, samples[0]
         ends = [t[span][[0, -1]] for span in find_rest_spans(t, motion, short=True)]
         inside = [(sample_s >= a) & (sample_s <= b) & np.isfinite(samples[1]).all(axis=1) for a, b in ends]
-        most = float(np.linalg.norm(axes, axis=1).max())
+        most = float(np.linalg.norm(axes, axis=1).max(initial=0.0))
         # A force that changes there is a load: the clocks are apart, or the video misses it.
         inside = [
             part
