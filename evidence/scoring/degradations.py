@@ -44,6 +44,16 @@ def _each(change: Callable[[Picture, int], Any], camera: str = "frames") -> Chan
     return apply
 
 
+def _both(change: Callable[[Picture, int], Any]) -> Change:
+    """A change of each image of both cameras."""
+
+    def apply(folder: Path) -> None:
+        for camera in (name for name in ("frames", "right") if (folder / name).is_dir()):
+            _each(change, camera)(folder)
+
+    return apply
+
+
 def _warp(rgb: Picture, x: float = 0, y: float = 0, scale: float = 1, turn_deg: float = 0) -> Any:
     """The image of a camera that is shifted [px], zoomed and turned about the middle."""
     matrix = cv2.getRotationMatrix2D((rgb.shape[1] / 2, rgb.shape[0] / 2), turn_deg, scale)
@@ -271,7 +281,7 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "focus lost later": (_later(_blur, 9), "sharp"),
     "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "^(scale|force)"),
     "E 4 times too large": (_stated(young_kpa=4.0), "^(stiffness|force)"),
-    "a second contact without sensor": (_each(_press_elsewhere), "^sensor: .*contact that"),
+    "a second contact without sensor": (_both(_press_elsewhere), "^sensor: .*contact that"),
     "sensor: mN": (_sensor(lambda t, f: (t, 1000 * f)), "in newtons|in mN|unit"),
     "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor: .*sign"),
     "sensor: axes": (_sensor(lambda t, f: (t, f[:, [1, 2, 0]])), "^sensor: .*axes"),

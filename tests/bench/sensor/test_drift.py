@@ -40,7 +40,7 @@ def test_a_load_that_lasts_or_a_video_without_motion_shows_no_zero() -> None:
 
 def test_short_rests_count_by_the_samples_of_the_sensor() -> None:
     t, fine = np.arange(0, 3, 0.125), np.arange(0, 3.4, 0.01)
-    load = np.clip(np.minimum(fine - 0.3, 2.4 - fine) / 0.4, 0, 1)[:, None] * [6.0, 0.0, 4.0]
+    load = np.clip(np.minimum(fine - 0.45, 2.4 - fine) / 0.4, 0, 1)[:, None] * [6.0, 0.0, 4.0]
     noise = np.random.default_rng(0).normal(0, 0.04, load.shape)
     for drift_mn, late in ((0.0, 0), (1.5, 0), (0.0, 30)):
         record = np.roll(load, -late, axis=0) + noise + drift_mn * fine[:, None] / 3.4 * [0.6, 0.0, 0.8]
