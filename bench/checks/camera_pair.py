@@ -30,10 +30,12 @@ def check_pairing(recording: Recording, tracked: TrackedRecording) -> list[Findi
     elif stereo.frozen >= _FROZEN:
         fault = f"is frozen in {stereo.frozen} frames in which the left camera's picture changes"
     elif stereo.tool_behind_px > _BEHIND_PX:
-        fault = "shows the tool behind the tissue: left and right are swapped"
+        fault = "shows the tool behind the tissue: left and right are swapped, or both mirrored"
     elif stereo.lag_s:
-        since = "" if stereo.lag_from_s is None else f", from {stereo.lag_from_s:.3g} s"
-        fault = f"is about {abs(stereo.lag_s):.2g} s {'late' if stereo.lag_s > 0 else 'early'}{since}"
+        fault = f"is about {abs(stereo.lag_s):.2g} s {'late' if stereo.lag_s > 0 else 'early'}"
+        if stereo.lag_from_s is not None:
+            fault += f", from {stereo.lag_from_s:.3g} s"
+            fault += ": or are pictures of the left one missing there?" if stereo.lag_s > 0 else ""
     else:
         return []
     return [Finding("error", "stereo", f"the right camera {fault}")]

@@ -52,6 +52,10 @@ _RISES = 0.3  # of the largest force, by which it rises and falls with a contact
 _LATE_S = 1.5  # largest clock error tried, in both directions
 _TRIED = 30  # largest number of lags, and twice that of positions of a gap
 _PART = 4  # least number of frames before and after a gap
+_UNSENSED = 0.15  # least force over the largest where the sensor measures none
+_RATE = 0.08  # least error of a clock's rate
+_EDGE_S = 0.1  # error of the time at which a contact begins or ends
+_TOP = 95.0  # percentile of a curve that is its height: spikes are above
 _COMMON = 0.6  # least share of the frames that a hypothesis covers
 
 
@@ -79,10 +83,90 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
     """The finding on a sensor that contradicts the leading method, with the likeliest causes."""
     if sensor.is_constant:
         return []
+    found = _check_hypotheses(sensor)
+    if sensor.pulsates or any(finding.cause == "clocks" for finding in found):
+        return found
+    edges = check_edges(sensor)
+    return found + (edges or ([] if found else check_unsensed(sensor)))
+
+
+def check_edges(sensor: SensorMotion) -> list[Finding]:
+    """The finding on contacts that begin and end at other times in the video than in the sensor's record.
+
+    Tissue follows a load at once, and creep only delays it. So equal errors of begin and end show an offset
+    of the clocks, errors that grow with time another rate, an end before that of force missing pictures.
+    """
+    frame_s = float(np.median(np.diff(sensor.time_s)))
+    force, moved = (_edges(sensor.time_s, curve) for curve in (sensor.size_mn, sensor.moved))
+    if not len(force) or len(force) != len(moved):
+        return []
+    late_s, what = moved - force, ""
+    offset_s, rate = float(np.median(late_s)), float(np.median(moved / force))
+    off_s, apart_s = np.abs(late_s - offset_s).max(), np.abs(moved - rate * force).max()
+    lost_s = late_s[::2] - late_s[1::2]  # of each contact
+    k = int(np.argmax(lost_s))
+    if min(off_s, apart_s) < max(0.5 * frame_s, 0.5 * _EDGE_S):
+        if apart_s < off_s and abs(rate - 1) > _RATE and np.abs(late_s).max() > 2 * frame_s:
+            what = (
+                f"contacts begin and end {rate:.3g} times as late in the video as in the sensor's record: a "
+            )
+            what += f"clock or the video is stamped with another rate (sync.rate {rate:.3f})"
+        elif abs(offset_s) > max(1.5 * frame_s, 2 * _EDGE_S):
+            what = (
+                f"contacts begin and end {abs(offset_s):.2f} s {'later' if offset_s > 0 else 'earlier'} in "
+            )
+            what += f"the video than in the sensor's record: add {offset_s:+.2f} s (sync.offset_s)"
+    elif lost_s[k] > max(2 * frame_s, 2 * _EDGE_S) and late_s[2 * k] < max(0.5 * frame_s, 0.5 * _EDGE_S):
+        what = f"a contact ends {lost_s[k]:.2f} s earlier in the video than in the sensor's record: are "
+        what += f"pictures missing between {moved[2 * k]:.2f} and {moved[2 * k + 1]:.2f} s?"
+    return [Finding("warning", "clocks", what)] if what else []
+
+
+def check_unsensed(sensor: SensorMotion) -> list[Finding]:
+    """The finding on a force in the video while the sensor measures none."""
+    if sensor.bounds_mn is None or sensor.leading_mn is None:
+        return []
+    # Without spikes, which are no peak.
+    top_mn = float(np.percentile(sensor.size_mn, _TOP))
+    most_mn = max(top_mn, float(np.linalg.norm(sensor.leading_mn, axis=1).max()))
+    contact_mn = 0.05 * top_mn
+    at_rest_mn = 0.0 if sensor.rest_mn is None else float(np.linalg.norm(sensor.rest_mn))
+    if max(3 * sensor.noise_mn, at_rest_mn) > contact_mn:  # the tare is wrong, or the rest frame is
+        return []
+    low = np.nan_to_num(sensor.bounds_mn[:, 0])
+    alone = (sensor.size_mn < contact_mn) & (low > _UNSENSED * most_mn)
+    runs = np.split(np.arange(len(alone)), np.flatnonzero(np.diff(alone)) + 1)
+    run = max((run for run in runs if alone[run[0]]), key=len, default=np.zeros(0, int))
+    # What isn't released within the video may be the camera's motion.
+    if len(run) < 2 or low[run[0] :].min() > _UNSENSED * most_mn:
+        return []
+    what = (
+        f"from {sensor.time_s[run[0]]:.2f} to {sensor.time_s[run[-1]]:.2f} s the video shows a force of at "
+    )
+    what += f"least {low[run].max():.2g} mN, but the sensor none: is there a contact that it doesn't hold?"
+    return [Finding("warning", "sensor", what)]
+
+
+def _edges(time_s: Floats, curve: Floats) -> Floats:
+    """Times (2 n,) [s] at which a curve (T,) rises and falls through half of its range, in turn; none if it
+    begins or ends above that, or crosses it for one frame only."""
+    level = 0.5 * (float(np.percentile(curve, _TOP)) + float(curve.min()))
+    above = (curve > level).astype(int)
+    first = np.flatnonzero(np.diff(above))  # the frames before
+    if above[0] or above[-1] or not len(first) or np.diff(first).min() < 2:
+        return np.zeros(0)
+    share = (level - curve[first]) / (curve[first + 1] - curve[first])
+    return np.asarray(time_s[first] + share * (time_s[first + 1] - time_s[first]))
+
+
+def _check_hypotheses(sensor: SensorMotion) -> list[Finding]:
+    """The finding on the likeliest causes of a contradiction, if there is one."""
     force, gains = _estimate(sensor)
     judged = sorted(_judge(sensor, force, gains), key=lambda one: -one.odds)
     missed = find_missed(sensor)
     likely = [one for one in judged if one.explains and one.odds > (_LIKELY if missed else _SURE)]
+    if missed and not likely:  # by little: what is left is a gain, if the curves are alike
+        likely = [one for one in judged if one.explains and one.hypothesis.any_gain]
     if not likely:
         cause = "no cause was found among gain, axes, rest frame and clocks"
         return [Finding("warning", "interval", f"{missed}; {cause}")] if missed else []
@@ -90,7 +174,7 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
     close = [one.hypothesis for one in likely if one.odds > best.odds - _ALIKE]
     names = dict[str, str]()  # the best of each cause
     for one in close:
-        names.setdefault(one.cause, one.message)
+        names.setdefault(one.message.split(":")[0] if one.turns else one.cause, one.message)
     start = missed or "sensor and video contradict each other"
     # Only what several methods agree on is certain: one may be wrong itself.
     sure = missed and best.odds > _SURE and len(sensor.forces_mn) > 1
@@ -239,6 +323,8 @@ def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:
         what = f"axes: the camera's are {names} of force.csv"
         if tool := set(signs) == {-1} and order == tuple(range(axes)):
             what = "the sign: force.csv holds the force on the tool (sensor.acts_on)"
+        elif order == tuple(range(axes)) and signs.count(-1) == 1:
+            what = f"a mirrored picture: the camera's axes are {names} of force.csv"
         turned = force.copy()
         turned[:, :axes] = force[:, list(order)] * signs
         yield Hypothesis(

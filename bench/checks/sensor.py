@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.force_fusion import Fusion
@@ -28,6 +29,10 @@ _LOADED = 0.25  # share of the range of force above which the tissue is not at r
 _CALM, _RESTS_S, _LEFT_S = 0.06, 0.6, 0.4
 _SIGMAS = 4.0  # of noise beyond which a force is no noise
 _PARTS, _SAMPLES = 8, 8  # of a span whose medians are compared: most parts, samples of each; by hand
+# By hand: rate [Hz] from which a leap of two samples is faster than any touch; least height of a leap, over
+# the range of force and over the usual difference from the samples around.
+_SPIKE_HZ, _SPIKE, _SPIKE_SIGMAS = 80.0, 0.3, 12.0
+_NAMED_SPIKES = 5  # most times that a message lists
 LEAST_FRAMES = 8  # for a judgement on the sensor; by hand
 _CONSTANT = 3  # frames of constant force that are no saturation
 _MOVES = 0.25  # share of the largest motion during constant force, from which it is one
@@ -44,6 +49,12 @@ def check_samples(recording: Recording) -> list[Finding]:
     if most > _SURGICAL_MN and recording.meta.tissue != "phantom":
         message = f"{most / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
         found.append(Finding("warning", "sensor", message))
+    spikes_s, height_mn = find_spikes(t, force.force_mn)
+    if len(spikes_s):
+        some = ", ".join(f"{time:.2f}" for time in spikes_s[:_NAMED_SPIKES])
+        message = f"{len(spikes_s)} spikes of up to {height_mn:.3g} mN and one or two samples (at {some}"
+        message += ", ... s)" if len(spikes_s) > _NAMED_SPIKES else " s)"
+        found.append(Finding("warning", "sensor", message + ": a loose cable? Leave these samples empty"))
     if not recording.meta.sensor.free_s and (bias := find_bias(force.force_mn)):
         found.append(Finding("warning", "sensor", bias))
     if not recording.meta.sensor.free_s:
@@ -75,6 +86,19 @@ def check_free_spans(recording: Recording) -> list[Finding]:
                 message += "there is a contact in it; end the span before, or begin it after"
                 found.append(Finding("warning", "sensor", message))
     return found
+
+
+def find_spikes(time_s: Floats, force_mn: Floats) -> tuple[Floats, float]:
+    """Times (M,) [s] of samples (N, 3) mN that leap away from those around them and back at once, and the
+    largest leap [mN]; none of a sensor so slow that a touch may be as short."""
+    known = np.isfinite(force_mn).all(axis=1)
+    t, force = time_s[known], force_mn[known]
+    if len(t) < 2 * _SAMPLES or (len(t) - 1) / np.ptp(t) < _SPIKE_HZ:
+        return np.zeros(0), 0.0
+    off = np.linalg.norm(force - median_filter(force, (5, 1), mode="nearest"), axis=1)
+    most = float(np.linalg.norm(np.ptp(np.percentile(force, (2, 98), axis=0), axis=0)))
+    leaps = off > max(_SPIKE * most, _SPIKE_SIGMAS * 1.4826 * float(np.median(off)))
+    return t[leaps], float(off[leaps].max(initial=0.0))
 
 
 def find_change(force_mn: Floats) -> tuple[float, float]:
@@ -233,7 +257,7 @@ def find_sensor_motion(
 def check_drift(sensor: SensorMotion) -> list[Finding]:
     """Findings on a zero that drifts: the sensor's force changes between spans with the tissue at rest."""
     drift = sensor.drift
-    if drift is None or not drift.is_clear:
+    if drift is None or not drift.is_clear or check_constant(sensor):
         return []
     first_s, last_s = drift.time_s[0], drift.time_s[-1]
     message = (

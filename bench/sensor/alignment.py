@@ -31,6 +31,7 @@ class AlignedSensor:
     notes: tuple[str, ...] = ()  # for the user
     findings: tuple[Finding, ...] = ()
     drift: Drift | None = None  # of the zero, against the video; None: unknown, or removed
+    samples: tuple[Floats, Floats] | None = None  # processed: times (N,) on the video's clock [s], (N, 3) mN
 
     @property
     def size_mn(self) -> Floats | None:
@@ -72,7 +73,8 @@ def align_sensor(
         why = f"the clocks could not be aligned ({found.refused}): {scored}"
         refused = [Finding("warning", "clocks", why)]
     about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
-    return AlignedSensor(axes if covered else None, *about, tuple(refused))
+    samples = processed.time_s, processed.force_mn
+    return AlignedSensor(axes if covered else None, *about, tuple(refused), samples=samples)
 
 
 def judge_drift(sensor: AlignedSensor, meta: SensorMeta, time_s: Floats, moved: Floats) -> AlignedSensor:
@@ -81,7 +83,10 @@ def judge_drift(sensor: AlignedSensor, meta: SensorMeta, time_s: Floats, moved: 
     `time_s`: (T,) of the frames [s]; `moved`: (T,) mean motion of the tissue since the rest frame, any unit,
     NaN where unknown.
     """
-    if sensor.axes_mn is None or (drift := find_drift(time_s, sensor.axes_mn, moved)) is None:
+    if sensor.axes_mn is None:
+        return sensor
+    drift = find_drift(time_s, sensor.axes_mn, moved, sensor.samples)
+    if drift is None:
         return sensor
     if meta.drift == "keep":
         return replace(sensor, drift=drift)

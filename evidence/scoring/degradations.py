@@ -44,6 +44,16 @@ def _each(change: Callable[[Picture, int], Any], camera: str = "frames") -> Chan
     return apply
 
 
+def _both(change: Callable[[Picture, int], Any]) -> Change:
+    """A change of each image of both cameras."""
+
+    def apply(folder: Path) -> None:
+        for camera in (name for name in ("frames", "right") if (folder / name).is_dir()):
+            _each(change, camera)(folder)
+
+    return apply
+
+
 def _warp(rgb: Picture, x: float = 0, y: float = 0, scale: float = 1, turn_deg: float = 0) -> Any:
     """The image of a camera that is shifted [px], zoomed and turned about the middle."""
     matrix = cv2.getRotationMatrix2D((rgb.shape[1] / 2, rgb.shape[0] / 2), turn_deg, scale)
@@ -73,6 +83,39 @@ def _ordered(order: Callable[[Any], Any], *parts: str) -> Change:
             recording_writer.write_frames(folder, time_s[: len(numbers)])
 
     return apply
+
+
+def _interlace(folder: Path) -> None:
+    """Takes every second row of each picture from the next one: a field later."""
+    files = sorted((folder / "frames").iterdir())
+    pictures = [_read(file) for file in files]
+    for file, rgb, after in zip(files, pictures, pictures[1:], strict=False):
+        rgb = rgb.copy()
+        rgb[1::2] = after[1::2]
+        cv2.imwrite(str(file), rgb[..., ::-1])
+
+
+def _mirror(folder: Path) -> None:
+    """Mirrors all pictures, also those that the user has drawn on them."""
+    for file in sorted(folder.rglob("*.png")):
+        cv2.imwrite(str(file), np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))[:, ::-1])
+
+
+def _burn_in(rgb: Picture, k: int) -> Any:
+    """The image with a clock at its upper left corner."""
+    place, font = (6, 24), cv2.FONT_HERSHEY_SIMPLEX
+    shown = np.ascontiguousarray(rgb)
+    return cv2.putText(shown, f"{k / FPS:08.3f}", place, font, 0.7, (255, 255, 255), 2, cv2.LINE_AA)
+
+
+def _press_elsewhere(rgb: Picture, k: int) -> Any:
+    """The image of tissue that a second instrument, which the sensor doesn't hold, presses late."""
+    y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]].astype(np.float32)
+    off = np.stack([x - 0.38 * rgb.shape[1], y - 0.36 * rgb.shape[0]], axis=-1)
+    load = np.clip(min(k - 12, 22 - k) / 3, 0, 1)
+    source = off * (1 + load * 0.35 * np.exp(-(off**2).sum(-1, keepdims=True) / (2 * 16**2))) - off
+    places = (np.stack([x, y], axis=-1) + source).astype(np.float32)
+    return cv2.remap(rgb, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
 def _noise(levels: float, rgb: Picture, k: int) -> Any:
@@ -122,14 +165,28 @@ def _swap_cameras(folder: Path) -> None:
         (folder / name).rename(folder / new)
 
 
-def _drift(share: float) -> Change:
-    """The sensor's zero rises by a share of the largest force over the recording."""
+def _spoil(change: Callable[[Floats, Floats], Floats]) -> Change:
+    """Another force (N, 3) N from the times' share (N, 1) of the record and the force over its peak."""
 
-    def change(t: Any, f: Any) -> Any:
-        most = np.linalg.norm(f, axis=1).max()
-        return t, f + share * most * np.outer((t - t[0]) / np.ptp(t), [0.6, 0.0, 0.8])
+    def spoiled(t: Floats, f: Floats) -> tuple[Floats, Floats]:
+        peak = float(np.linalg.norm(f, axis=1).max())
+        return t, peak * change(((t - t[0]) / np.ptp(t))[:, None], f / peak)
 
-    return _sensor(change)
+    return _sensor(spoiled)
+
+
+def _stuck(share: Floats, f: Floats) -> Floats:
+    return np.where(share < 0.35, f, f[int(0.35 * len(f))])
+
+
+def _spikes(share: Floats, f: Floats) -> Floats:
+    rng, shown = np.random.default_rng(1), f.copy()
+    shown[rng.integers(0, len(f), 12)] += 4 * rng.normal(size=(12, 3))
+    return shown
+
+
+def _lost(share: Floats, f: Floats) -> Floats:
+    return np.where((share > 0.3) & (share < 0.42), np.nan, f)
 
 
 def _offset(folder: Path) -> None:
@@ -157,15 +214,17 @@ def _draw_tissue(radius: float, inside: bool) -> Change:
     return apply
 
 
-def _invert_masks(folder: Path) -> None:
-    height, width = _read(sorted((folder / "frames").iterdir())[0]).shape[:2]
-    (folder / "masks").mkdir(exist_ok=True)
-    for k in range(FRAMES):
-        file = folder / "masks" / f"{k:06d}.png"
-        mask = np.zeros((height, width), np.uint8)
-        if file.exists():
-            mask = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
-        cv2.imwrite(str(file), 255 - mask)
+def _draw_masks(change: Callable[[Pixels], Any]) -> Change:
+    """Instrument masks (H, W) that are changed; black ones where there are none."""
+
+    def apply(folder: Path) -> None:
+        size = _read(sorted((folder / "frames").iterdir())[0]).shape[:2]
+        (folder / "masks").mkdir(exist_ok=True)
+        for file in (folder / "masks" / f"{k:06d}.png" for k in range(FRAMES)):
+            mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.exists() else np.zeros(size, np.uint8)
+            cv2.imwrite(str(file), change(np.asarray(mask, np.uint8)))
+
+    return apply
 
 
 def _damage(cut: bool) -> Change:
@@ -198,64 +257,59 @@ def _blur(rgb: Picture) -> Any:
     return cv2.GaussianBlur(rgb, (0, 0), 3)
 
 
-_COARSE, _UNITS, _AGAIN = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", "again"
-_MISSING, _LATE = r"^pictures: .*missing|^clocks|^times", "^stereo: .*(late|early)"
+_COARSE, _AGAIN, _LIGHT = "^pictures: .*(detail|compressed)", "again", "^pictures: .*light"
+_MISSING, _LATE = "^(pictures|stereo): .*missing|^clocks|^times", "^stereo: .*(late|early)"
+_UNMASKED = "^(tool|foreground): .*masks"
+_BROKEN = "damaged|cut off|cannot be read|unreadable|not readable"
 _PAIR = {"calibration": "stereo.yaml", "mm_per_unit": 2}
 # What makes it, and a pattern of the finding that names it; empty: the force should stay the same.
 MONOCULAR: dict[str, tuple[Change, str]] = {
     "camera bumped by 5 px": (_later(lambda rgb: _warp(rgb, 4, 3)), "^camera"),
     "zoom by 1%": (_later(lambda rgb: _warp(rgb, scale=1.01)), "^camera"),
-    "rotation by 2 deg": (_later(lambda rgb: _warp(rgb, turn_deg=2)), "^camera"),
-    "camera drifts by 6 px": (_each(lambda rgb, k: _warp(rgb, k / 6)), "^camera"),
     "first picture under load": (_begin_late, "^rest frame|most likely.*rest frame"),
     "frozen for 5 frames": (_ordered(lambda k: np.where((k > 7) & (k < 13), 8, k)), _AGAIN),
+    "each frame twice": (_ordered(lambda k: k - k % 2), _AGAIN),
     "4 frames dropped": (_ordered(lambda k: k[(k < 8) | (k > 11)]), _MISSING),
-    "4 frames late": (_ordered(lambda k: np.maximum(k - 4, 0)), f"{_MISSING}|{_AGAIN}"),
-    "frames reversed": (_ordered(lambda k: k[::-1]), "^clocks"),
-    "half the light later": (_later(lambda rgb: 0.5 * rgb), "^pictures: .*light"),
+    "a part at double speed": (_ordered(lambda k: k[(k < 6) | (k > 15) | (k % 2 == 0)]), _MISSING),
+    "half the light later": (_later(lambda rgb: 0.5 * rgb), _LIGHT),
+    "gamma of 0.6 later": (_later(lambda rgb: 255 * (rgb / 255) ** 0.6), _LIGHT),
     "a hand comes into view": (_later(lambda rgb: _cover(rgb, (222, 202, 180), 0.3, 0.7)), "^foreground"),
     "letterbox": (_each(lambda rgb, k: np.pad(rgb[20:-20], ((20, 20), (0, 0), (0, 0)))), "bars"),
+    "interlaced": (_interlace, "interlaced"),
+    "mirrored": (_mirror, "mirrored"),
     "H.264 at crf 51": (_compress, _COARSE),
-    "noise of 30 levels": (_each(lambda rgb, k: rgb + _noise(30, rgb, k)), "noisy"),
-    "dark": (_each(lambda rgb, k: 0.2 * rgb + _noise(1, rgb, k)), "dim"),
-    "blur of 3 px": (_later(_blur, 0), "detail"),
     "focus lost later": (_later(_blur, 9), "sharp"),
-    "scale 1.5 times too large": (_stated(scale_mm_per_px=1.5), "^scale"),
     "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "^(scale|force)"),
-    "scale in cm": (_stated(scale_mm_per_px=0.1), "^scale"),
-    "E 5 times too large": (_stated(young_kpa=5.0), "^(stiffness|force)"),
-    "E in Pa": (_stated(young_kpa=1000.0), "^stiffness"),
-    "sensor: 2 times too large": (_sensor(lambda t, f: (t, 2 * f)), "^(sensor|force)"),
-    "sensor: mN": (_sensor(lambda t, f: (t, 1000 * f)), _UNITS),
-    "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor"),
-    "sensor: axes": (_sensor(lambda t, f: (t, f[:, [1, 2, 0]])), "^sensor"),
-    "sensor: saturated": (_sensor(lambda t, f: (t, f.clip(f.min() / 2, f.max() / 2))), "^sensor"),
-    "sensor: clock 8% fast": (_sensor(lambda t, f: (t * 1.08, f)), "^clocks"),
-    "sensor: clock 0.6 s off": (_sensor(lambda t, f: (t - 0.6, f)), "^clocks"),
-    "sensor: drift of a fifth": (_drift(0.2), "drift"),
+    "E 4 times too large": (_stated(young_kpa=4.0), "^(stiffness|force)"),
+    "a second contact without sensor": (_both(_press_elsewhere), "^sensor: .*contact that"),
+    "sensor: mN": (_sensor(lambda t, f: (t, 1000 * f)), "in newtons|in mN|unit"),
+    "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor: .*sign"),
+    "sensor: axes": (_sensor(lambda t, f: (t, f[:, [1, 2, 0]])), "^sensor: .*axes"),
+    "sensor: saturated": (_sensor(lambda t, f: (t, f.clip(f.min() / 2, f.max() / 2))), "saturated"),
+    "sensor: stuck": (_spoil(_stuck), "^sensor: .*stuck"),
+    "sensor: spikes": (_spoil(_spikes), "^sensor: .*spike"),
+    "sensor: samples lost": (_spoil(_lost), "^files: .*without a force"),
+    "sensor: drift of a fifth": (_spoil(lambda share, f: f + 0.2 * share * [0.6, 0.0, 0.8]), "drift"),
     "sensor: offset without a tare": (_offset, "^sensor|^rest frame"),
     "sensor: free_s under load": (_free_under_load, "free_s"),
+    "sensor: clock 0.3 s off": (_sensor(lambda t, f: (t - 0.3, f)), "^clocks"),
+    "sensor: times in ms": (_sensor(lambda t, f: (1000 * t, f)), "^clocks.*milliseconds"),
     "sensor: stamped as 30 for 25": (_sensor(lambda t, f: (t * 25 / 30, f)), "^clocks"),
     "tissue.png: a blob": (_draw_tissue(0.06, True), "^tissue|tissue.png"),
-    "tissue.png: inverted": (_draw_tissue(0.4, False), "^tissue|tissue.png"),
-    "masks: inverted": (_invert_masks, "^tool"),
-    "video: cut off": (_damage(True), "cut off|damaged|cannot be read|unreadable|not readable"),
-    "video: corrupt packets": (_damage(False), "damaged|cut off|cannot be read|unreadable|not readable"),
+    "masks: empty": (_draw_masks(lambda mask: 0 * mask), _UNMASKED),
+    "masks: 5 frames late": (_ordered(lambda k: np.maximum(k - 5, 0), "masks"), _UNMASKED),
+    "video: corrupt packets": (_damage(False), _BROKEN),
     "white balance": (_each(lambda rgb, k: rgb * [1.2, 1, 0.7]), ""),
     "gauze at rest": (_later(lambda rgb: _cover(rgb, (225, 220, 212), 0, 0.2), 0), ""),
-    "grey": (_each(lambda rgb, k: rgb @ np.full((3, 3), 1 / 3)), ""),
     "flicker": (_each(lambda rgb, k: rgb * (1 + 0.15 * (-1) ** k)), ""),
+    "a clock burnt in": (_each(_burn_in), ""),
 }  # fmt: skip
 STEREO: dict[str, tuple[Change, str]] = {
     "right camera a frame late": (_ordered(lambda k: np.maximum(k - 1, 0), "right"), _LATE),
-    "right camera frozen": (_ordered(lambda k: np.minimum(k, 6), "right"), "^stereo"),
-    "right camera mirrored": (_later(lambda rgb: rgb[:, ::-1], 0, "right"), "mirrored"),
-    "right camera 4 rows down": (_later(lambda rgb: np.roll(rgb, 4, axis=0), 0, "right"), "rows"),
     "right camera bumped by 3 px": (
         _later(lambda rgb: _warp(rgb, 2.4, 1.8), camera="right"),
         "^stereo|right camera",
     ),
-    "right camera out of focus": (_later(_blur, 0, "right"), "^stereo"),
     "right camera of another site": (_later(lambda rgb: rgb[::-1], 0, "right"), "^stereo|mirrored|match"),
     "right camera's gain: half": (_later(lambda rgb: 0.5 * rgb, 0, "right"), ""),
     "cameras swapped": (_swap_cameras, "swapped"),

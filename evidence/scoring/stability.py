@@ -2,10 +2,11 @@
 
 Each change is applied to a described recording with two cameras (tissue, instruments and contact-free span
 stated) and to a bare one with one camera (scale and E only); plain, covered and pulsating tissue take turns.
-A row is *silent* if its force errs by a tenth of the peak more than that of the undegraded recording, is not
-held back, and no finding names the cause: a finding of another kind clears nothing, nor does an interval
-that is wide enough to hold any force. It is *vague* if it is stated with an interval wider than the peak, of
-which nobody can act. Undegraded recordings show what each further statement gains.
+A fault is *missed* if no finding names its cause, the force is stated, and it errs by a tenth of the peak
+more than that of the undegraded recording, unless its interval holds the true force and is narrower than the
+peak: then, or with the usual error, it is *harmless*. It is missed too if a finding names another cause. An
+interval that is wider than the peak holds any force, and clears nothing: nobody can act on it. Undegraded
+recordings show what each further statement gains.
 """
 
 import re
@@ -38,13 +39,16 @@ _TISSUE: dict[str, dict[str, Any]] = {
     "membrane": {"membrane": {"probability": 1.0}},
     "pulse": {"pulse": {"heart_mm": (0.1, 0.3), "breath_mm": (0.1, 0.3)}},
 }
-_USUAL = {"skull": ("bonded",), "membrane": {"probability": 0.0}}
+_USUAL = {"skull": ("bonded",), "membrane": {"probability": 0.0}, "instruments": (1, 1)}
+_SHOWN = {"contact": ("driven",), "gestures": ("pull",), "travel_mm": (1.0, 3.0), "travel_scale": "even"}
 _GIVEN = "scale and E", "tissue, instruments", "a span without contact", "the membrane's state"
 _CASES = (2, 2), (0, 1)  # of degraded recordings: how much is stated, of `_GIVEN`; cameras
-_CLEAN = 4  # undegraded recordings of each kind
+_CLEAN = 2  # undegraded recordings of each kind
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _WRONG = 0.1  # of the peak
 _VAGUE = 1.0  # width of the interval over the peak, from which it says nothing
+_NO_CAUSES = {"tracking", "network and physics", "physics", "interval"}  # findings that name no fault
+_HOLDS = 0.8  # least share of the frames in which a right interval of 90% holds the true force
 
 
 def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_TISSUE)) -> dict[str, Any]:
@@ -59,15 +63,32 @@ def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_T
             turn = list(_TISSUE)[(number + given // 2 + cameras) % len(_TISSUE)]
             known = (given, cameras) in _CASES and (cameras == 2 or name in MONOCULAR)
             if known and kind == turn and re.search(only, name):
-                row = _scored(folders[0], change, case, work, seed, name)
+                # Masks that are wrong are masks that are given.
+                about = case | {"given": max(given, 1)} if name.startswith("masks") else case
+                row = _scored(folders[0], change, about, work, seed, name)
                 named = any(re.search(cause, one) for one in row["findings"]) if cause else None
-                points.append({"change": name, **case, **row, "usual": usual[0]["error"], "named": named})
+                before = {f"usual_{key}": usual[0][key] for key in ("error", "over_time")}
+                others = _causes(row) - _causes(usual[0]) - _NO_CAUSES
+                row |= {"named": named, "misnamed": named is False and bool(others)}
+                points.append({"change": name, **case, **row, **before})
     return {"seed": seed, "points": points, "undegraded": clean}
 
 
-def is_silent(row: Mapping[str, Any]) -> bool:
-    """Whether a force is wrong, not held back, and no finding names the cause."""
-    return row["named"] is False and (row["error"] or 0.0) > _WRONG + (row.get("usual") or 0.0)
+def _causes(row: Mapping[str, Any]) -> set[str]:
+    return {message.split(":")[0] for message in row["findings"]}
+
+
+def judge(row: Mapping[str, Any]) -> str:
+    """The outcome of a change: named, held back, harmless, missed, or that there is no cause to name."""
+    if row["named"] is None:
+        return "no cause to name"
+    if row["named"] or row.get("misnamed"):
+        return "named" if row["named"] else "missed"
+    if row["error"] is None:
+        return "held back"
+    wrong = any(row[key] > _WRONG + (row.get(f"usual_{key}") or 0.0) for key in ("error", "over_time"))
+    holds = (row.get("held") or 0.0) >= _HOLDS and not is_vague(row)
+    return "missed" if wrong and not holds else "harmless"
 
 
 def is_vague(row: Mapping[str, Any]) -> bool:
@@ -75,15 +96,11 @@ def is_vague(row: Mapping[str, Any]) -> bool:
     return row.get("width") is not None and row["width"] > _VAGUE
 
 
-def count_caught(points: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """Number of ways to degrade whose cause is named or whose force is held back in every recording, of all
-    that have a cause to name."""
-    caught = [
-        all(row["named"] or row["error"] is None for row in rows)
-        for _, rows in report.grouped(points, "change").items()
-        if rows[0]["named"] is not None
-    ]
-    return sum(caught), len(caught)
+def judge_all(points: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The worst outcome of each change over its recordings, by name."""
+    order = "missed", "harmless", "held back", "named", "no cause to name"
+    each = report.grouped(points, "change").items()
+    return {name: min(map(judge, rows), key=order.index) for (name,), rows in each}
 
 
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -98,7 +115,9 @@ def _rendered(work: Path, kind: str, seed: int) -> list[Path]:
     """Stereo recordings of 3 s that state everything, with a sensor at a higher rate and with noise."""
     data, job = work / f"{kind} {seed}", reader.load_job("mission")
     settings = {"seed": seed + list(_TISSUE).index(kind), "sequences": _CLEAN, "frames": FRAMES, "fps": FPS}
-    fem = FemSection.model_validate({**job.fem.model_dump(exclude_unset=True), **_USUAL, **_TISSUE[kind]})
+    fem = FemSection.model_validate(
+        {**job.fem.model_dump(exclude_unset=True), **_USUAL, **_SHOWN, **_TISSUE[kind]}
+    )
     render_job(job.model_copy(update={**settings, "fem": fem}), data, workers=1)
     folders = []
     for sequence in Dataset(data):
@@ -149,7 +168,7 @@ def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: 
     """Errors of the leading force and width of its interval, of the peak, and findings; cached in `work`."""
 
     def compute() -> dict[str, Any]:
-        row: dict[str, Any] = dict.fromkeys(("error", "over_time", "width"))
+        row: dict[str, Any] = dict.fromkeys(("error", "over_time", "width", "held"))
         folder = degrade(source, change, case, work)
         try:
             result = score(folder, _model(case["cameras"] == 2))
@@ -160,55 +179,60 @@ def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: 
         known = result.scored & np.isfinite(main.size_mn) & np.isfinite(sensor)
         if result.refused or main.low_mn is None or main.high_mn is None or known.sum() < 2:
             return row
-        peak_mn = 1000 * float(np.linalg.norm(read_table(source / "force.csv")[:, 1:], axis=1).max())
+        true = read_table(source / "force.csv")
+        size_mn = 1000 * np.linalg.norm(true[:, 1:], axis=1)
+        true_mn, peak_mn = np.interp(result.time_s, true[:, 0], size_mn), float(size_mn.max())
         row["error"] = abs(float(main.size_mn[known].max() - sensor[known].max())) / peak_mn
         row["over_time"] = float(np.abs(main.size_mn - sensor)[known].mean()) / peak_mn
         row["width"] = float((main.high_mn - main.low_mn)[known].mean()) / peak_mn
+        margin = 3 * _SENSOR_NOISE * peak_mn
+        inside = (true_mn > main.low_mn - margin) & (true_mn < main.high_mn + margin)
+        row["held"] = float(inside[known].mean())
         return row
 
     return stored.result(work / "points", "change", stored.key(source.name, dict(case), *key), compute)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """The silent rows, the names of the other changes, and errors of undegraded recordings."""
-    points = found["points"]
-    silent = [row for row in points if is_silent(row)]
+    """The missed rows, the outcome of every change, and errors of undegraded recordings."""
+    points, outcomes = found["points"], judge_all(found["points"])
+    missed = [row for row in points if judge(row) == "missed"]
     table = [
         {"change": row["change"], "recording": f"{row['kind']}, {row['cameras']}"}
         | {name: None if row.get(key) is None else f"{row[key]:.0%}" for name, key in _COLUMNS.items()}
-        for row in silent
+        for row in missed
     ]
-    quiet, names = {row["change"] for row in silent}, dict[str, list[str]]()
-    for (name,), rows in report.grouped(points, "change").items():
-        if name not in quiet:
-            outcome = "no cause to name" if rows[0]["named"] is None else "held back or named"
-            names.setdefault(outcome, []).append(name)
+    names = dict[str, list[str]]()
+    for name, outcome in outcomes.items():
+        names.setdefault(outcome, []).append(name)
     stated = [
         {"stated, with all above": _GIVEN[given]}
         | {f"{row['kind']}, {row['cameras']}": f"{row['over_time']:.0%}" for row in rows}
         for (given,), rows in report.grouped(found["undegraded"], "given").items()
     ]
-    ways = len(report.grouped(points, "change"))
-    verdict = f"**In {len(silent)} of {len(points)} recordings, degraded in {ways} ways, {_VERDICT}"
-    caught, faults = count_caught(points)
-    verdict += f" Named or held back in every recording: {caught} of {faults} faults."
+    counts = {outcome: len(some) for outcome, some in names.items()}
+    faults = len(outcomes) - counts.get("no cause to name", 0)
+    caught = counts.get("named", 0) + counts.get("held back", 0)
+    verdict = f"**Of {faults} faults {caught} are named or held back in every recording, "
+    verdict += f"{counts.get('harmless', 0)} are harmless and {counts.get('missed', 0)} missed.**"
     if stated_rows := [row for row in points if row.get("width") is not None]:
         vague = sum(map(is_vague, stated_rows))
         verdict += f" Of {len(stated_rows)} stated forces {vague} have an interval wider than the peak."
     others = [f"*{outcome}*: {'; '.join(some)}." for outcome, some in names.items()]
     sections = [
-        report.Section("Wrong without its cause", table),
-        report.Section("Other changes", (), others),
+        report.Section("Missed", table),
+        report.Section("Each change, by its worst recording", (), others),
         report.Section("Undegraded: mean error, of the peak", stated),
     ]
     return report.Page("Scoring: degraded recordings", found, (verdict, _CASES_ARE), sections)
 
 
-_COLUMNS = {"error of the peak": "error", "undegraded": "usual", "width of the interval": "width"}
-_VERDICT = (
-    "the force is wrong by more than a tenth of the peak and no finding names the cause.** A finding of "
-    "another kind clears no row; without a figure for the undegraded recording every such error counts."
-)
+_COLUMNS = {
+    "error of the peak": "error",
+    "undegraded": "usual_error",
+    "over time": "over_time",
+    "width": "width",
+}
 _CASES_ARE = (
     "The force is that of the default command. 2: two cameras; tissue, instruments and the span without "
     "contact are stated. 1: one camera; scale and Young's modulus only."

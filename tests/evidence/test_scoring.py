@@ -82,19 +82,25 @@ def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
 
 
 def test_neither_another_finding_nor_a_wide_interval_clears_a_wrong_force() -> None:
-    row = {"error": 0.9, "usual": 0.05, "width": 2.0, "findings": ["foreground: a hand"], "named": False}
-    assert stability.is_silent(row)
-    assert not stability.is_silent(row | {"named": True})
-    assert not stability.is_silent(row | {"error": None}), "held back"
-    assert not stability.is_silent(row | {"usual": 0.85}), "the undegraded recording errs as much"
-    assert not stability.is_silent(row | {"named": None}), "there is no cause to name"
+    row = {"error": 0.9, "over_time": 0.1, "usual_error": 0.05, "width": 2.0, "held": 1.0, "named": False}
+    assert stability.judge(row) == "missed"
+    assert stability.judge(row | {"width": 0.8}) == "harmless", "a narrow interval holds the true force"
+    assert stability.judge(row | {"width": 0.8, "held": 0.5}) == "missed"
+    assert stability.judge(row | {"usual_error": 0.85}) == "harmless", "the undegraded recording errs as much"
+    assert stability.judge(row | {"error": 0.0}) == "harmless"
+    assert stability.judge(row | {"error": 0.0, "over_time": 0.3}) == "missed"
+    assert stability.judge(row | {"error": 0.0, "misnamed": True}) == "missed", "another cause is named"
+    assert stability.judge(row | {"named": True}) == "named"
+    assert stability.judge(row | {"error": None}) == "held back"
+    assert stability.judge(row | {"named": None}) == "no cause to name"
 
 
-def test_a_change_is_caught_if_it_is_in_each_recording_and_a_wide_interval_is_vague() -> None:
+def test_a_change_is_judged_by_its_worst_recording_and_a_wide_interval_is_vague() -> None:
     held, named = {"change": "a", "error": None, "named": False}, {"change": "a", "error": 0.9, "named": True}
-    missed = {"change": "b", "error": 0.9, "named": False}
+    missed = {"change": "b", "error": 0.9, "over_time": 0.1, "named": False}
     harmless = {"change": "c", "error": 0.0, "named": None}
-    assert stability.count_caught([held, named, missed, held | {"change": "b"}, harmless]) == (1, 2)
+    outcomes = stability.judge_all([held, named, missed, held | {"change": "b"}, harmless])
+    assert outcomes == {"a": "held back", "b": "missed", "c": "no cause to name"}
     assert [stability.is_vague({"width": width}) for width in (None, 0.4, 1.6)] == [False, False, True]
 
 
@@ -116,9 +122,14 @@ def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
 
 def test_each_degradation_changes_a_recording(tmp_path: Path) -> None:
     source = Maker(tmp_path)(frames=degradations.FRAMES, meta={"membrane": "stripped"})
-    (source / "right").mkdir()
-    for file in (source / "frames").iterdir():
-        cv2.imwrite(str(source / "right" / file.name), cv2.imread(str(file))[:, ::-1])
+    for part in ("right", "masks"):
+        (source / part).mkdir(exist_ok=True)
+    for k, file in enumerate(sorted((source / "frames").iterdir())):
+        picture = cv2.imread(str(file))
+        cv2.imwrite(str(source / "right" / file.name), picture[:, ::-1])
+        mask = np.zeros(picture.shape[:2], np.uint8)
+        mask[:, 2 * k : 2 * k + 10] = 255
+        cv2.imwrite(str(source / "masks" / f"{k:06d}.png"), mask)
     meta = degradations.read_meta(source)
     recording_writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
 

@@ -177,7 +177,7 @@ class Decoder:
         if given is not None and not findings and is_inside_out(tissue):
             inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
             findings.append(Finding("warning", "tissue", inverted))
-        if (tissue & bars).any():
+        if bars.any() and (self._footage.findings or (tissue & bars).any()):  # found tissue has none of them
             share = f"{100 * bars.mean():.0f}% of the picture are black bars, removed from the tissue mask"
             findings.append(Finding("warning", "pictures", share))
         tissue = shrink_mask(tissue & ~bars, shrink, 127)

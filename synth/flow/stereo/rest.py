@@ -18,6 +18,7 @@ from synth.flow.image import flags
 from synth.flow.tvl1 import Tvl1
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
+_LEAST_TISSUE = 0.05  # share of the picture, below which its mask is in doubt
 _BLOCK = 5  # px, side of the matched blocks; the penalties are those that OpenCV suggests for it
 _ALIKE = 0.5  # least local correlation of a match; chosen by hand
 _ENOUGH = 0.05  # share of the tissue that must match; chosen by hand
@@ -60,9 +61,10 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
     padded = [cv2.copyMakeBorder(one, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for one in levels]
     raw = matcher.compute(*padded)[:, pad:-pad].astype(np.float32) / 16
     found = (raw >= low) & left_usable
-    unmatched = UserError(
-        f"stereo: the left and right rest pictures do not match at disparities from {low} to {high} px"
-    )
+    why, share = f"at disparities from {low} to {high} px", float(left_usable.mean())
+    if share < _LEAST_TISSUE:
+        why += f" on the tissue, which is {100 * share:.2g}% of the picture: is tissue.png right?"
+    unmatched = UserError(f"stereo: the left and right rest pictures do not match {why}")
     if not found.any():
         raise unmatched
     # From the nearest match.

@@ -71,6 +71,61 @@ def test_a_span_with_white_noise_does_not_change_and_one_with_a_step_does() -> N
         assert change > sensor_checks._SIGMAS * deviation
 
 
+def test_spikes_are_found_and_noise_steps_and_slow_sensors_have_none() -> None:
+    t, rng = np.arange(0, 5.2, 0.01), np.random.default_rng(3)
+    for load in (load_mn(t), 0 * load_mn(t)):  # a step is no spike
+        clean = load + rng.normal(0, 0.4, (len(t), 3)) + 20.0 * (t > 3.2)[:, None]
+        assert not len(sensor_checks.find_spikes(t, clean)[0])
+        spiked = clean.copy()
+        spiked[[100, 101, 340]] += [60.0, -40.0, 0.0]
+        times_s, height_mn = sensor_checks.find_spikes(t, spiked)
+        np.testing.assert_allclose(times_s, t[[100, 101, 340]])
+        assert height_mn == pytest.approx(72, rel=0.05)
+        assert not len(sensor_checks.find_spikes(10 * t, spiked)[0]), "10 Hz: a touch may be as short"
+
+
+def _compared(video_s: np.ndarray, more_mn: np.ndarray | float = 0.0) -> list[tuple[str, str]]:
+    """Findings where the frames (T,) show what the sensor measures at `video_s` (T,), and `more_mn` (T,)."""
+    t = np.arange(0, 5.2, 0.1)
+    size = np.linalg.norm(load_mn(video_s), axis=1) ** 0.8 * 2 + more_mn  # tissue stiffens
+    leading = size[:, None] * [0.3, 0.1, 0.95]
+    bounds = size[:, None] * [0.6, 1.6] + [-3.0, 3.0]
+    sensor = SensorMotion(t, load_mn(t), size, (leading,), 0, leading, bounds, np.zeros(3))
+    return [(finding.cause, finding.message) for finding in check_contradiction(sensor)]
+
+
+def test_clocks_are_judged_by_the_begin_and_end_of_contacts() -> None:
+    t = np.arange(0, 5.2, 0.1)
+    assert _compared(t) == []
+    assert _compared(t - 0.05) == [], "creep"
+    for late_s in (-0.35, 0.3, 0.5):
+        ((cause, message),) = _compared(t - late_s)
+        assert cause == "clocks"
+        assert f"{late_s:+.1f}" in message or f"{late_s:+.2f}" in message
+    assert {cause for cause, _ in _compared(t / 1.2)} == {"clocks"}
+    assert {cause for cause, _ in _compared(np.where(t < 1.8, t, t + 0.4))} == {"clocks"}, "pictures missing"
+
+
+def test_a_force_that_the_sensor_does_not_measure_is_found() -> None:
+    t = np.arange(0, 5.2, 0.1)
+    beside = 40.0 * np.exp(-(((t - 0.6) / 0.15) ** 2))
+    ((cause, message),) = _compared(t, beside)
+    assert cause == "sensor"
+    assert "contact" in message
+    assert _compared(t, 0.1 * beside) == []
+
+
+def test_axes_of_a_mirrored_picture_are_named() -> None:
+    t = np.arange(0, 5.2, 0.1)
+    force = load_mn(t) * [1.0, 1.0, 0.3]
+    leading, size = force * [-1, 1, 1], np.linalg.norm(force, axis=1)
+    bounds = size[:, None] * [0.5, 1.5] + [-3.0, 3.0]
+    sensor = SensorMotion(t, force, size, (leading,), 2, leading, bounds, np.zeros(3))
+    (finding,) = check_contradiction(sensor)
+    assert finding.cause == "sensor"
+    assert "mirrored" in finding.message
+
+
 def _turned(estimate: np.ndarray, axes: np.ndarray) -> set[str]:
     """Causes found where the video's force is the true one turned by `estimate` (3, 3) and the sensor's
     by `axes` (3, 3)."""

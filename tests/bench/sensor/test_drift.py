@@ -36,4 +36,17 @@ def test_noise_is_no_drift(noise_mn: float) -> None:
 
 def test_a_load_that_lasts_or_a_video_without_motion_shows_no_zero() -> None:
     assert find_drift(TIME, LOAD, np.maximum.accumulate(MOVED)) is None
+
+
+def test_short_rests_count_by_the_samples_of_the_sensor() -> None:
+    t, fine = np.arange(0, 3, 0.125), np.arange(0, 3.4, 0.01)
+    load = np.clip(np.minimum(fine - 0.45, 2.4 - fine) / 0.4, 0, 1)[:, None] * [6.0, 0.0, 4.0]
+    noise = np.random.default_rng(0).normal(0, 0.04, load.shape)
+    for drift_mn, late in ((0.0, 0), (1.5, 0), (0.0, 30)):
+        record = np.roll(load, -late, axis=0) + noise + drift_mn * fine[:, None] / 3.4 * [0.6, 0.0, 0.8]
+        axes = np.stack([np.interp(t, fine, column) for column in record.T], axis=1)
+        moved = np.interp(t, fine, np.linalg.norm(load, axis=1))
+        assert find_drift(t, axes, moved) is None, "too few frames"
+        drift = find_drift(t, axes, moved, (fine, record))
+        assert (drift is not None and drift.is_clear) == bool(drift_mn), "a late clock is no drift"
     assert find_rest_spans(TIME, 0.004 + 0.001 * RNG.random(80)) == []
