@@ -56,6 +56,7 @@ class TVL1Settings:
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
+    confirmed: float = 0.3  # agreement at which coarse levels keep a tracked initial flow wholly
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
@@ -109,10 +110,10 @@ class Tvl1:
             self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
         levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
-        fine = levels
+        fine, tracked = levels, initial is not None
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
-        found = steadied(solve(fine, initial, s), s.steady_px)
+        found = steadied(solve(fine, initial, s, tracked=tracked), s.steady_px)
         warped, visible = image.warp(levels[0].now, levels[0].now_usable, found)
         return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
@@ -141,30 +142,53 @@ def guess(levels: list[Level], s: TVL1Settings) -> Map:
     return large if trust[1] > _BETTER * trust[0] else small
 
 
-def solve(levels: list[Level], initial: Map | None, s: TVL1Settings) -> Map:
-    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
-    flow: Map = np.zeros((2, *levels[-1].now.shape), np.float32)
+def solve(levels: list[Level], initial: Map | None, s: TVL1Settings, *, tracked: bool = False) -> Map:
+    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result.
+
+    `tracked`: the initial flow is that of the last frame. Coarse levels then smooth what they add to it: if
+    they smoothed all of it, they would erase motion of a small area, even the true one, and finer levels
+    don't see so far (of 7 to 24 px at contacts of `mission` and `clinical` a third to two thirds was lost).
+    """
+    start = [np.zeros((2, *levels[0].now.shape), np.float32) if initial is None else initial]
     weight = np.full(levels[0].now.shape, s.weight, np.float32)
-    if initial is not None:
-        flow = initial
-        if s.steep > 0:
-            weight = weight * (1 + steepness(flow) / np.float32(s.steep**2))
-        for _ in levels[1:]:
-            flow = np.float32(0.5) * image.halved(flow)
-    for level in reversed(levels):
-        shape = level.now.shape
-        if flow.shape[1:] != shape:
-            flow = finer(flow, level)
-        here = image.resized(weight[None], shape)[0]
-        flow = _solve_level(level, flow, here, s, s.bending_px if level is levels[0] else 0.0)
+    if initial is not None and s.steep > 0:
+        weight = weight * (1 + steepness(initial) / np.float32(s.steep**2))
+    for _ in levels[1:]:
+        start.append(np.float32(0.5) * image.halved(start[-1]))
+    kept = _confirmed(levels, start, s.confirmed) if tracked else [None] * len(levels)
+    flow = start[-1]
+    for k in reversed(range(len(levels))):
+        if k + 1 < len(levels):
+            flow = start[k] + finer(flow - start[k + 1], levels[k])
+        here = image.resized(weight[None], levels[k].now.shape)[0]
+        flow = _solve_level(levels[k], flow, here, s, kept[k], 0.0 if k else s.bending_px)
     return flow
 
 
-def _solve_level(level: Level, flow: Map, weight: Map, s: TVL1Settings, bending_px: float) -> Map:
+def _confirmed(levels: list[Level], start: list[Map], agreed: float) -> list[Map | None]:
+    """What of the initial flow each coarse level keeps: what pictures confirm, filled from around elsewhere.
+
+    Otherwise a moving shadow or an uncovered area drags its flow along from frame to frame.
+    """
+    if len(levels) == 1:
+        return [None]
+    warped, visible = image.warp(levels[1].now, levels[1].now_usable, start[1])
+    sure = np.minimum(confidence.agreement(levels[1], warped, visible) / np.float32(agreed), 1) ** 2
+    kept: list[Map | None] = [None]
+    flow = np.stack([image.fill(plane, sure) for plane in start[1]])
+    for _ in levels[1:]:
+        kept.append(flow)
+        flow = np.float32(0.5) * image.halved(flow)
+    return kept
+
+
+def _solve_level(
+    level: Level, flow: Map, weight: Map, s: TVL1Settings, kept: Map | None, bending_px: float
+) -> Map:
     """All warps of a level: each linearises r about the flow, weights it and minimises the energy.
 
-    The smoothness term sees the flow less its Gaussian mean: of all of it, it damps a wave of wavenumber k by
-    1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
+    The smoothness term sees the flow less `kept` (2, H, W), or less its Gaussian mean: of all of it, it damps
+    a wave of wavenumber k by 1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
     """
     rest, now, rest_usable, now_usable = level.rest, level.now, level.rest_usable, level.now_usable
     found = flow.copy()
@@ -190,7 +214,7 @@ def _solve_level(level: Level, flow: Map, weight: Map, s: TVL1Settings, bending_
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
             here = weight * np.float32(np.clip(share, *_WEIGHT_LIMITS))
-        last, mean = found, _ZERO
+        last, mean = found, _ZERO if kept is None else kept
         if bending_px > 0:
             mean = image.doubled(image.window(last, bending_px), rest.shape)
         found = last - mean
