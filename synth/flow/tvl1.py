@@ -30,6 +30,7 @@ from synth.system.jit import argument_types, vectorised
 _BETTER = 1.025  # factor in agreement by which the guess for large motion must exceed that for small motion
 _AGREED = 0.6  # agreement below which the confidence of the network is lowered
 _WEIGHT_LIMITS = 0.45, 1.5  # of the noise weight: avoids too much or too little smoothing
+_FINE = 1  # levels that `follow` solves once
 _LANES = 16  # floats of the widest vector registers
 _ZERO, _HALF, _ONE, _TWO, _EIGHT = (np.float32(number) for number in (0, 0.5, 1, 2, 8))
 
@@ -56,7 +57,9 @@ class TVL1Settings:
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
-    confirmed: float = 0.3  # agreement at which coarse levels keep a tracked initial flow wholly
+    better: float = (
+        0.1  # difference of agreement between using one and using the other coarse flow of `follow`
+    )
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
@@ -113,7 +116,7 @@ class Tvl1:
         fine, tracked = levels, initial is not None
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
-        found = steadied(solve(fine, initial, s, tracked=tracked), s.steady_px)
+        found = steadied(follow(fine, initial, s) if tracked else solve(fine, initial, s), s.steady_px)
         warped, visible = image.warp(levels[0].now, levels[0].now_usable, found)
         return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
@@ -142,44 +145,63 @@ def guess(levels: list[Level], s: TVL1Settings) -> Map:
     return large if trust[1] > _BETTER * trust[0] else small
 
 
-def solve(levels: list[Level], initial: Map | None, s: TVL1Settings, *, tracked: bool = False) -> Map:
-    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result.
+def solve(levels: list[Level], initial: Map | None, s: TVL1Settings) -> Map:
+    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
+    finest = levels[0].now.shape
+    flow = np.zeros((2, *finest), np.float32) if initial is None else initial
+    return _refine(levels, _pyramid(flow, len(levels))[-1], _weights(finest, initial, s), s)
 
-    `tracked`: the initial flow is that of the last frame. Coarse levels then smooth what they add to it: if
-    they smoothed all of it, they would erase motion of a small area, even the true one, and finer levels
-    don't see so far (of 7 to 24 px at contacts of `mission` and `clinical` a third to two thirds was lost).
+
+def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
+    """As `solve`, from the flow of the last frame.
+
+    On coarse levels smoothness erases large motion of a small area, even the true one, and finer levels don't
+    see so far: of 7 to 24 px at contacts of `mission` and `clinical` a third to two thirds was lost. Coarse
+    levels are therefore solved a second time, smoothing only what they add to the last flow, which is used
+    where pictures agree better with it: used everywhere, it never lets go of a wrong match.
     """
-    start = [np.zeros((2, *levels[0].now.shape), np.float32) if initial is None else initial]
-    weight = np.full(levels[0].now.shape, s.weight, np.float32)
-    if initial is not None and s.steep > 0:
-        weight = weight * (1 + steepness(initial) / np.float32(s.steep**2))
-    for _ in levels[1:]:
-        start.append(np.float32(0.5) * image.halved(start[-1]))
-    kept = _confirmed(levels, start, s.confirmed) if tracked else [None] * len(levels)
-    flow = start[-1]
+    if len(levels) <= _FINE:
+        return solve(levels, last, s)
+    weight, start = _weights(last.shape[1:], last, s), _pyramid(last, len(levels))
+    coarse, all_smooth = levels[_FINE:], replace(s, bending_px=0.0)
+    both = [_refine(coarse, start[-1], weight, all_smooth, kept) for kept in (None, start[_FINE:])]
+    warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in both]
+    trust = [confidence.agreement(coarse[0], *pictures) for pictures in warped]
+    share = np.clip(_HALF + (trust[1] - trust[0]) / np.float32(s.better), 0, 1)
+    flow = finer(both[0] + share * (both[1] - both[0]), levels[_FINE - 1])
+    return _refine(levels[:_FINE], flow, weight, s)
+
+
+def _weights(shape: tuple[int, ...], initial: Map | None, s: TVL1Settings) -> Map:
+    """lambda at each pixel (H, W), which rises where the initial flow is steep."""
+    weight = np.full(shape, s.weight, np.float32)
+    return (
+        weight
+        if initial is None or s.steep <= 0
+        else weight * (1 + steepness(initial) / np.float32(s.steep**2))
+    )
+
+
+def _pyramid(flow: Map, count: int) -> list[Map]:
+    """A flow (2, H, W) px on so many levels, in pixels of each."""
+    levels = [flow]
+    for _ in range(count - 1):
+        levels.append(np.float32(0.5) * image.halved(levels[-1]))
+    return levels
+
+
+def _refine(
+    levels: list[Level], flow: Map, weight: Map, s: TVL1Settings, kept: list[Map] | None = None
+) -> Map:
+    """Flow of the finest level from that of the coarsest; `kept`: on each level, see `_solve_level`."""
     for k in reversed(range(len(levels))):
-        if k + 1 < len(levels):
-            flow = start[k] + finer(flow - start[k + 1], levels[k])
-        here = image.resized(weight[None], levels[k].now.shape)[0]
-        flow = _solve_level(levels[k], flow, here, s, kept[k], 0.0 if k else s.bending_px)
+        shape = levels[k].now.shape
+        if flow.shape[1:] != shape:
+            flow = finer(flow, levels[k])
+        here = image.resized(weight[None], shape)[0]
+        part = None if kept is None else kept[k]
+        flow = _solve_level(levels[k], flow, here, s, part, 0.0 if k else s.bending_px)
     return flow
-
-
-def _confirmed(levels: list[Level], start: list[Map], agreed: float) -> list[Map | None]:
-    """What of the initial flow each coarse level keeps: what pictures confirm, filled from around elsewhere.
-
-    Otherwise a moving shadow or an uncovered area drags its flow along from frame to frame.
-    """
-    if len(levels) == 1:
-        return [None]
-    warped, visible = image.warp(levels[1].now, levels[1].now_usable, start[1])
-    sure = np.minimum(confidence.agreement(levels[1], warped, visible) / np.float32(agreed), 1) ** 2
-    kept: list[Map | None] = [None]
-    flow = np.stack([image.fill(plane, sure) for plane in start[1]])
-    for _ in levels[1:]:
-        kept.append(flow)
-        flow = np.float32(0.5) * image.halved(flow)
-    return kept
 
 
 def _solve_level(
