@@ -113,10 +113,13 @@ class Tvl1:
             self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
         levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
-        fine, tracked = levels, initial is not None
-        if initial is None and len(levels) > 1:
-            initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
-        found = steadied(follow(fine, initial, s) if tracked else solve(fine, initial, s), s.steady_px)
+        if initial is not None:
+            found = follow(levels, initial, s)
+        elif len(levels) > 1:
+            found = solve(levels[: s.fine_levels], finer(guess(levels[1:], s), levels[0]), s)
+        else:
+            found = solve(levels, None, s)
+        found = steadied(found, s.steady_px)
         warped, visible = image.warp(levels[0].now, levels[0].now_usable, found)
         return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 

@@ -104,7 +104,7 @@ def test_large_motion_of_a_small_area_is_followed_and_a_wrong_flow_is_let_go() -
     # With coarse levels that smooth all of the last flow it is 0.80.
     assert (flow * shot.flow)[contact].sum() / (shot.flow[contact] ** 2).sum() > 0.86
     still = stage.against(rest, 0.0, rng)
-    found, _ = Tvl1(corrected=False).flow(rest[0], still.now, rest[1] ^ True, still.now_usable, flow)
+    found, _ = Tvl1(corrected=False).flow(rest[0], still.now, ~rest[1], still.now_usable, flow)
     assert np.linalg.norm(found, axis=-1)[~still.hidden].mean() < 0.5
 
 
