@@ -57,9 +57,7 @@ class TVL1Settings:
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
-    better: float = (
-        0.1  # difference of agreement between using one and using the other coarse flow of `follow`
-    )
+    better: float = 0.1  # see `follow`: change of agreement over which it turns; 0: no flow is a last frame's
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
@@ -114,7 +112,7 @@ class Tvl1:
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
         levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
         if initial is not None:
-            found = follow(levels, initial, s)
+            found = (follow if s.better > 0 else solve)(levels, initial, s)
         elif len(levels) > 1:
             found = solve(levels[: s.fine_levels], finer(guess(levels[1:], s), levels[0]), s)
         else:
@@ -178,11 +176,9 @@ def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
 def _weights(shape: tuple[int, ...], initial: Map | None, s: TVL1Settings) -> Map:
     """lambda at each pixel (H, W), which rises where the initial flow is steep."""
     weight = np.full(shape, s.weight, np.float32)
-    return (
-        weight
-        if initial is None or s.steep <= 0
-        else weight * (1 + steepness(initial) / np.float32(s.steep**2))
-    )
+    if initial is not None and s.steep > 0:
+        weight = weight * (1 + steepness(initial) / np.float32(s.steep**2))
+    return weight
 
 
 def _pyramid(flow: Map, count: int) -> list[Map]:
