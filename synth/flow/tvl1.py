@@ -58,6 +58,7 @@ class TVL1Settings:
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
     better: float = 0.1  # see `follow`: change of agreement over which it turns; 0: no flow is a last frame's
+    large_px: float = 2.0  # there: length from which motion is large
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
@@ -157,11 +158,11 @@ def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
     """As `solve`, from the flow of the last frame.
 
     On coarse levels smoothness erases large motion of a small area, even the true one, and finer levels don't
-    see so far: of 7 to 24 px at contacts of `mission` and `clinical` a third to two thirds was lost. Coarse
-    levels are therefore solved a second time, smoothing only what they add to the last flow, which is used
-    where pictures agree better with it: used everywhere, it never lets go of a wrong match.
+    see so far: of 7 to 24 px at contacts of `mission` and `clinical` a third to two thirds was lost. If the
+    last flow is large, coarse levels are therefore solved a second time, smoothing only what they add to it.
+    That is used where pictures agree better with it: used everywhere, it never lets go of a wrong match.
     """
-    if len(levels) <= _FINE:
+    if len(levels) <= _FINE or np.hypot(*last).max() <= s.large_px:
         return solve(levels, last, s)
     weight, start = _weights(last.shape[1:], last, s), _pyramid(last, len(levels))
     coarse, all_smooth = levels[_FINE:], replace(s, bending_px=0.0)
