@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from synth.arrays import Map, Mask
 from synth.errors import UserError
 from synth.flow.image import flags
-from synth.flow.tvl1 import Tvl1
+from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
 _LEAST_TISSUE = 0.05  # share of the picture, below which its mask is in doubt
@@ -85,5 +85,5 @@ def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start
     initial = np.stack([-start, np.zeros_like(start)])
     pictures = np.ascontiguousarray(left), np.ascontiguousarray(right)
     usable = flags(left_usable), flags(right_usable)
-    flow, trust, _ = Tvl1(corrected=False).uncorrected(*pictures, *usable, initial)
+    flow, trust, _ = Tvl1(TVL1Settings(better=0.0), corrected=False).uncorrected(*pictures, *usable, initial)
     return flow, trust

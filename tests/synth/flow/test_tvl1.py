@@ -91,6 +91,23 @@ def test_flow_from_rest_to_now_does_not_drift() -> None:
     assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
 
 
+def test_large_motion_of_a_small_area_is_followed_and_a_wrong_flow_is_let_go() -> None:
+    recipe = Recipe(size=128, pull=16.0, reach=0.12, tool=16.0, contrast=0.3)
+    stage = Stage.set(recipe, rng := np.random.default_rng(12))
+    rest, every = stage.rest(rng), np.ones((128, 128), bool)
+    tracker = track.Tracker(Tvl1(corrected=False), *rest[:2], every)
+    for step in range(1, 9):
+        shot = stage.against(rest, step / 8, rng)
+        flow, _ = tracker.step(shot.now, ~shot.now_usable)
+    length = np.linalg.norm(shot.flow, axis=-1)
+    contact = (length > 0.6 * length.max()) & shot.inside & ~shot.hidden
+    # With coarse levels that smooth all of the last flow it is 0.80.
+    assert (flow * shot.flow)[contact].sum() / (shot.flow[contact] ** 2).sum() > 0.86
+    still = stage.against(rest, 0.0, rng)
+    found, _ = Tvl1(corrected=False).flow(rest[0], still.now, ~rest[1], still.now_usable, flow)
+    assert np.linalg.norm(found, axis=-1)[~still.hidden].mean() < 0.5
+
+
 class _FixedConfidence:
     """An estimator of given confidence, with and without the surroundings."""
 
