@@ -80,7 +80,7 @@ def test_what_has_moved_under_a_mask_is_held_by_it_and_an_object_beside_it_is_no
 
 
 @pytest.mark.parametrize("radius_px", [0, 16, 25])
-@pytest.mark.parametrize("peak_px", [7.0, 25.0])
+@pytest.mark.parametrize("peak_px", [10.0, 25.0])
 def test_tissue_that_flow_loses_as_it_moves_far_is_no_object_and_another_colour_in_it_is(
     radius_px: int, peak_px: float
 ) -> None:
