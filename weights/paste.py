@@ -265,13 +265,13 @@ def _reflect(thing: Thing, shift: Floats, picture: Map, inner: Map) -> Map:
     mirror, width = thing.mirror, inner.shape[1]
     assert mirror is not None
     slope = _slopes(inner)
-    places = [np.ascontiguousarray((part + 1) * (_SIDE // 2)) for part in np.moveaxis(slope, -1, 0)]
-    around = cv2.remap(mirror.surroundings, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    columns, rows = (np.ascontiguousarray((part + 1) * (_SIDE // 2)) for part in np.moveaxis(slope, -1, 0))
+    around = cv2.remap(mirror.surroundings, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # Just inside its rim a round body mirrors what is just outside, further in what is far away.
     steep = np.linalg.norm(slope, axis=-1)
     far = width * mirror.reach * np.clip((1 - steep) / np.maximum(steep - 0.6, 0.15), 0, 2)
     y, x = np.indices(inner.shape, np.float32)
-    away = np.float32(slope / np.maximum(steep, 1e-3)[..., None] * far[..., None])
+    away = np.asarray(slope / np.maximum(steep, 1e-3)[..., None] * far[..., None], np.float32)
     smeared = cv2.GaussianBlur(picture, (0, 0), max(0.5, mirror.rough * width))
     beside = cv2.remap(
         smeared, x + away[..., 0], y + away[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
