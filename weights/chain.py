@@ -51,8 +51,8 @@ def make(
     They are not put next to the modules: whether they are better than those there is to be measured first.
     `drawn`: drawn pairs for the corrections; `steps`: of the segmentation, with 12 examples each, or 96 on
     the `device` "cuda"; `minutes`: CPU time of each correction. `start`: weights (ONNX) of a segmentation to
-    train on from, where some 4000 steps at a `pace` of 0.3 times the learning rate are enough. What a folder
-    has is made again only where settings or weights below differ.
+    train on from, `pace`: factor on its learning rate. What a folder has is made again only where settings or
+    weights below differ.
     """
     device = choose_device(device).type
     counts = {"randomized": randomized, "mission": mission}
