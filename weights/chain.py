@@ -43,13 +43,16 @@ def make(
     minutes: float = 40.0,
     seed: int = 0,
     device: str = "cpu",
+    start: Path | None = None,
+    pace: float = 1.0,
 ) -> None:
     """Renders sequences of two jobs, trains in turn, and writes weights and cards to `made` in the folder.
 
     They are not put next to the modules: whether they are better than those there is to be measured first.
     `drawn`: drawn pairs for the corrections; `steps`: of the segmentation, with 12 examples each, or 96 on
-    the `device` "cuda"; `minutes`: CPU time of each correction. What a folder has is made again only where
-    settings or weights below differ.
+    the `device` "cuda"; `minutes`: CPU time of each correction. `start`: weights (ONNX) of a segmentation to
+    train on from, `pace`: factor on its learning rate. What a folder has is made again only where settings or
+    weights below differ.
     """
     device = choose_device(device).type
     counts = {"randomized": randomized, "mission": mission}
@@ -63,7 +66,8 @@ def make(
         depth = part is depth_correction
         settings: dict[str, Any] = {"drawn": drawn, "minutes": minutes}
         if part is segmentation:
-            settings = {"steps": steps, "device": device}
+            settings = {"steps": steps, "device": device, "pace": pace}
+            settings["start"] = None if start is None else _short_hash(start)
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
         made = folder / f"{name}-{key}.onnx"
@@ -71,7 +75,7 @@ def make(
             net: torch.nn.Module
             if part is segmentation:
                 frames, checkpoint = [dict(np.load(file)) for file in sequences], made.with_suffix(".ckpt")
-                net, data = segmentation_training.train(frames, steps, seed, checkpoint, device)
+                net, data = segmentation_training.train(frames, steps, seed, checkpoint, device, start, pace)
             else:
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
@@ -81,7 +85,11 @@ def make(
         for suffix in (".onnx", ".json"):
             shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
         vars(part).update(WEIGHTS=made)  # the next part learns from what is recovered with these
-        below[name] = hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]
+        below[name] = _short_hash(weights)
+
+
+def _short_hash(weights: Path) -> str:
+    return hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]
 
 
 def _render(job: str, count: int, folder: Path) -> Iterator[Path]:

@@ -101,6 +101,19 @@ def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
     onnx.save(model, file)
 
 
+def read_onnx(net: nn.Module, file: Path) -> None:
+    """Gives a network the weights of an ONNX file that `write_onnx` wrote of one like it."""
+    import onnx
+
+    halves = onnx.load(file).graph.initializer
+    values = {half.name.removesuffix(" half"): onnx.numpy_helper.to_array(half) for half in halves}
+    state = net.state_dict()
+    # Counts of batches, which only training uses, aren't in the file.
+    net.load_state_dict(
+        state | {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
+    )
+
+
 def export(net: nn.Module, file: Path, card: Mapping[str, Any], channels: int) -> None:
     """Writes a network with its number of inputs as ONNX, and next to it its card."""
     file.parent.mkdir(parents=True, exist_ok=True)

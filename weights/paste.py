@@ -1,7 +1,8 @@
 """Instruments and other objects, shadows and highlights drawn over pictures, with exact masks.
 
 For training of the segmentation by cut and paste (D. Dwibedi et al., "Cut, paste and learn", ICCV 2017): what
-they look like matters less than that they are of every shape, colour and sharpness.
+they look like matters less than that they are of every shape, colour and sharpness. Polished metal needs more
+care: it mirrors dark surroundings and lamps, and at its rims and tip the tissue, into which it fades.
 """
 
 from __future__ import annotations
@@ -16,6 +17,14 @@ from synth.arrays import Floats, Map
 
 Outline = tuple[str, Floats, float]
 _WIDE = 0.15  # share of the picture's width beyond which an object is no instrument
+_POLISHED = 0.6  # chance that an instrument mirrors
+# Share of each colour that steel, gold, black, blue and titanium mirror, and how often they are drawn.
+_METALS = np.array([[1, 1, 1], [1, 0.78, 0.4], [0.25, 0.25, 0.27], [0.5, 0.65, 1.1], [1.05, 0.8, 0.95]])
+_OFTEN = 0.6, 0.1, 0.1, 0.1, 0.1
+_VESSELS = np.array(
+    [[45, 65, 120], [95, 50, 100], [120, 40, 45], [125, 130, 140], [185, 165, 160]]
+)  # grey levels
+_SIDE = 65  # of the map of a mirror's surroundings
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +44,20 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
+class Mirror:
+    """What polished metal shows: surroundings by its slope, and the tissue next to it."""
+
+    metal: Floats  # (3,) share of the light that it mirrors
+    surroundings: Map  # (_SIDE, _SIDE, 3) grey levels by the slopes along y and x, each -1 to 1
+    fade: float  # share of the surroundings' light that is left far from the tip
+    edge: float  # slope from which it mirrors tissue
+    blend: float  # range of slopes over which this begins
+    near: float  # picture widths from the tip over which all of it mirrors tissue
+    reach: float  # how far away this tissue is, in picture widths
+    rough: float  # picture widths over which it is smeared
+
+
+@dataclass(frozen=True, eq=False)
 class Thing:
     """An object to be drawn: its outline at any place, and its surface."""
 
@@ -45,6 +68,9 @@ class Thing:
     shine: float  # grey levels of the bright line along the body
     soft_px: float  # defocus
     shades: tuple[tuple[Floats, float, float], ...]  # of its shadows: offset, blur [picture widths], strength
+    mirror: Mirror | None = None  # replaces the colour and the texture
+    details: tuple[tuple[Outline, float], ...] = ()  # rings, sleeves and screws, and by how much brighter
+    grain: Map | None = None  # (H, W) of mean 1: noise on it and on its shadows, as a path tracer leaves it
 
 
 def draw_instrument(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
@@ -73,7 +99,14 @@ def draw_instrument(rng: np.random.Generator, picture: Map, other: Map) -> Thing
     else:
         blade = np.array([tip + rng.uniform(0.05, 0.2) * way, tip])
         parts = [("line", blade, wide * rng.uniform(1.2, 2.5)), ("line", np.stack([blade[0], end]), wide)]
-    return _finish(parts, rng, picture, other)
+    thing = _finish(parts, rng, picture, other)
+    if rng.random() < 0.3:
+        thing = replace(thing, details=_details(tip, way, wide, rng))
+    if rng.random() < _POLISHED:
+        noise = 1 + rng.uniform(0, 0.3) * rng.standard_normal(picture.shape[:2], np.float32)
+        grain = np.asarray(noise, np.float32) if rng.random() < 0.5 else None
+        thing = replace(thing, mirror=_polish(rng), grain=grain)
+    return thing
 
 
 def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
@@ -117,20 +150,26 @@ def _lines(grid: bool, rng: np.random.Generator, picture: Map, other: Map) -> Th
 
 def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:
     """A layer with an object moved by `shift` (2,) picture widths, and its shadows."""
-    body = _cover(thing, shift, layer.instrument.shape)
+    body = _cover(thing.outlines, shift, layer.instrument.shape)
     picture, shadow = layer.picture, layer.shadow
     width = body.shape[1]
+    grain = np.ones_like(body) if thing.grain is None else thing.grain
     for offset, blur, strength in thing.shades:
-        shade = _cover(thing, shift + offset, body.shape)
+        shade = _cover(thing.outlines, shift + offset, body.shape)
         shade = strength * cv2.GaussianBlur(shade, (0, 0), max(0.3, blur * width))
+        shade = np.clip(shade * grain, 0, 1)
         picture = picture * (1 - shade[..., None])
         shadow = np.maximum(shadow, shade)
-    inner = cv2.distanceTransform((body > 0.5).astype(np.uint8), cv2.DIST_L2, 3)
-    inner /= max(float(np.percentile(inner[inner > 0], 95)), 1.0) if (inner > 0).any() else 1.0
-    shade = 1 - thing.round * np.clip(1 - inner, 0, 1) ** 2
+    inner = _inner(body)
+    shade = 1 - thing.round * (1 - inner) ** 2
     line = np.exp(-(((inner - 0.7) / 0.12) ** 2))
     surface = thing.colour if thing.texture is None else thing.texture
     surface = surface * shade[..., None] + thing.shine * line[..., None]
+    if thing.mirror is not None:
+        surface = _reflect(thing, shift, picture, inner)
+    for outline, brighter in thing.details:
+        surface = surface * (1 + brighter * _cover((outline,), shift, body.shape)[..., None])
+    surface = surface * grain[..., None]
     soft = body if thing.soft_px < 0.3 else cv2.GaussianBlur(body, (0, 0), thing.soft_px)
     picture = picture * (1 - soft[..., None]) + surface * soft[..., None]
     free = 1 - body
@@ -155,6 +194,136 @@ def add_highlights(layer: Layer, rng: np.random.Generator) -> Layer:
     lit = layer.picture + strength[..., None] * np.maximum(white - layer.picture, 0)
     found = np.maximum(layer.highlight, np.clip(2 * strength, 0, 1))
     return Layer(np.asarray(lit, np.float32), layer.instrument, layer.shadow, found)
+
+
+def add_vessels(layer: Layer, rng: np.random.Generator) -> Layer:
+    """A layer with thick round vessels of any colour that wind and cross; they are tissue."""
+    shape = layer.instrument.shape
+    picture, highlight = layer.picture, layer.highlight
+    light, lit = rng.normal(size=2), rng.uniform(0, 0.5)
+    light /= np.linalg.norm(light)
+    hue = _vessel_colour(rng)
+    for _ in range(int(rng.integers(1, 4))):
+        if rng.random() < 0.3:
+            hue = _vessel_colour(rng)
+        wide = float(np.exp(rng.uniform(np.log(0.025), np.log(0.13))))
+        cover = _cover((_path(wide, rng),), np.zeros(2), shape)
+        inner = _inner(cover)
+        slope = _slopes(inner)
+        mottle = 1 + rng.uniform(0, 0.12) * noise_field(shape, float(rng.uniform(5, 60)), rng)
+        shade = (1 - lit * np.clip(slope @ light, -1, 1) - rng.uniform(0, 0.4) * (1 - inner) ** 2) * mottle
+        # A crest is wet where it faces the lamp: a broken line along it.
+        off = ((slope - rng.uniform(0, 0.6) * light) ** 2).sum(-1) / rng.uniform(0.05, 0.4) ** 2
+        broken = np.clip(0.5 + rng.uniform(0, 2) * noise_field(shape, float(rng.uniform(8, 60)), rng), 0, 1)
+        wet = cover * broken * np.exp(-off) * rng.uniform(0, 1.2) * (rng.random() < 0.8)
+        opaque = rng.uniform(0.6, 1) * cv2.GaussianBlur(cover, (0, 0), float(rng.uniform(0.5, 3)))
+        picture = picture + opaque[..., None] * (hue * shade[..., None] - picture)
+        picture = picture + np.clip(wet, 0, 1)[..., None] * np.maximum(245 - picture, 0)
+        highlight = np.maximum(highlight, np.clip(2 * wet - 0.6, 0, 1))
+    return replace(
+        layer, picture=np.asarray(picture, np.float32), highlight=np.asarray(highlight, np.float32)
+    )
+
+
+def _vessel_colour(rng: np.random.Generator) -> Floats:
+    """Grey levels (3,): a blue, purple, red or steel one, or any."""
+    if rng.random() < 0.7:
+        return np.asarray(rng.choice(_VESSELS) * rng.uniform(0.6, 1.4) * rng.uniform(0.8, 1.2, 3))
+    return rng.uniform(20, 230, 3)
+
+
+def _path(wide: float, rng: np.random.Generator) -> Outline:
+    """A winding line across the picture; some end in it."""
+    turn, t = rng.uniform(0, 2 * np.pi), np.linspace(-1.5 if rng.random() < 0.75 else 0.0, 1.5, 80)[:, None]
+    way = np.array([np.cos(turn), np.sin(turn)])
+    waves = [rng.normal(0, 0.07 / k) * np.sin(k * rng.uniform(2, 7) * t + rng.uniform(0, 6)) for k in (1, 2)]
+    middle = rng.uniform(0, 1, 2) * [1, 0.75]
+    return "line", middle + t * way + sum(waves) * np.array([-way[1], way[0]]), wide
+
+
+def _polish(rng: np.random.Generator) -> Mirror:
+    """A random metal in random surroundings."""
+    metal = _METALS[int(rng.choice(len(_METALS), p=_OFTEN))]
+    metal = metal * rng.uniform(0.45, 1.0) * (1 + rng.normal(0, 0.04, 3))
+    slopes = np.stack(np.meshgrid(*[np.linspace(-1, 1, _SIDE)] * 2), -1)
+    bands = noise_field((_SIDE, _SIDE), float(rng.uniform(10, 60)), rng)[..., None]
+    level = np.exp(rng.uniform(np.log(15), np.log(200)))
+    around = level * np.clip(1 + rng.uniform(0, 0.7) * bands, 0, 3)
+    for _ in range(int(rng.integers(0, 4))):  # lamps
+        off = ((slopes - rng.uniform(-0.7, 0.7, 2)) ** 2).sum(-1) / np.exp(rng.uniform(-3.3, -1.2)) ** 2
+        around = around + rng.uniform(60, 350) * np.exp(-off)[..., None]
+    around = np.broadcast_to(around, (_SIDE, _SIDE, 3)) * (1 + rng.normal(0, 0.05, 3))
+    edge, blend = rng.uniform(0.3, 1.0), rng.uniform(0.05, 0.5)
+    near = np.exp(rng.uniform(np.log(0.01), np.log(0.5)))
+    reach, rough = rng.uniform(0, 0.15), np.exp(rng.uniform(np.log(0.003), np.log(0.04)))
+    surroundings = np.asarray(around, np.float32)
+    return Mirror(metal, surroundings, rng.uniform(0.2, 1), edge, blend, near, reach, rough)
+
+
+def _reflect(thing: Thing, shift: Floats, picture: Map, inner: Map) -> Map:
+    """What an object's surface (H, W, 3) mirrors in front of a picture."""
+    mirror, width = thing.mirror, inner.shape[1]
+    assert mirror is not None
+    slope = _slopes(inner)
+    columns, rows = (np.ascontiguousarray((part + 1) * (_SIDE // 2)) for part in np.moveaxis(slope, -1, 0))
+    around = cv2.remap(mirror.surroundings, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # Just inside its rim a round body mirrors what is just outside, further in what is far away.
+    steep = np.linalg.norm(slope, axis=-1)
+    far = width * mirror.reach * np.clip((1 - steep) / np.maximum(steep - 0.6, 0.15), 0, 2)
+    y, x = np.indices(inner.shape, np.float32)
+    away = np.asarray(slope / np.maximum(steep, 1e-3)[..., None] * far[..., None], np.float32)
+    smeared = cv2.GaussianBlur(picture, (0, 0), max(0.5, mirror.rough * width))
+    beside = cv2.remap(
+        smeared, x + away[..., 0], y + away[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+    points = thing.outlines[0][1]
+    tip = points[0] + shift
+    way = points[len(points) // 2] + shift - tip
+    way = way / max(float(np.linalg.norm(way)), 1e-6)
+    along = np.maximum(((np.stack([x, y], -1) / width - tip) @ way), 0) / mirror.near
+    close = np.exp(-along)
+    share = np.clip((steep - mirror.edge) / mirror.blend + close, 0, 1)[..., None]
+    dim = (mirror.fade + (1 - mirror.fade) * np.exp(-0.2 * along))[..., None]
+    return np.asarray(mirror.metal * (share * beside + (1 - share) * dim * around), np.float32)
+
+
+def _details(
+    tip: Floats, way: Floats, wide: float, rng: np.random.Generator
+) -> tuple[tuple[Outline, float], ...]:
+    """Random rings, a sleeve or a screw on a shaft, and by what share each is brighter."""
+    side = np.array([-way[1], way[0]]) * wide
+    kind, start, brighter = rng.integers(3), rng.uniform(0.02, 0.5), float(rng.uniform(-0.8, 0.8))
+    if kind == 0:
+        middles = [tip + (start + wide * step) * way for step in _steps(rng)]
+        outlines = [("line", np.stack([middle - side, middle + side]), 0.2 * wide) for middle in middles]
+    elif kind == 1:
+        outlines = [("line", np.stack([tip + start * way, tip + 2 * way]), 1.3 * wide)]
+    else:
+        screw = tip + start * way
+        outlines = [("line", np.stack([screw, screw]), wide * rng.uniform(0.3, 0.7))]
+    return tuple((outline, brighter) for outline in outlines)
+
+
+def _steps(rng: np.random.Generator) -> Floats:
+    return np.asarray(rng.uniform(0.3, 1.5) * np.arange(rng.integers(1, 8)))
+
+
+def _inner(body: Map) -> Map:
+    """0 at the rim of a body, 1 at its middle, (H, W)."""
+    depth = cv2.distanceTransform((body > 0.5).astype(np.uint8), cv2.DIST_L2, 5)
+    if not depth.any():
+        return np.asarray(depth, np.float32)
+    size = 2 * int(np.ceil(min(float(np.percentile(depth[depth > 0], 95)), 60))) + 1
+    most = cv2.GaussianBlur(cv2.dilate(depth, np.ones((size, size), np.uint8)), (0, 0), size / 4)
+    return np.asarray(np.clip(depth / np.maximum(most, 1.0), 0, 1), np.float32)
+
+
+def _slopes(inner: Map) -> Map:
+    """Slopes (H, W, 2) along x and y of a round body, 1 outwards at its rim."""
+    smooth = cv2.GaussianBlur(inner, (0, 0), 1.0)
+    rise = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *way, ksize=3) for way in ((1, 0), (0, 1))], -1)
+    rise /= np.maximum(np.linalg.norm(rise, axis=-1, keepdims=True), 1e-6)
+    return np.asarray(-rise * (1 - inner)[..., None], np.float32)
 
 
 def _taper(tip: Floats, way: Floats, wide: float, rng: np.random.Generator) -> Outline:
@@ -190,10 +359,10 @@ def _finish(parts: list[Outline], rng: np.random.Generator, picture: Map, other:
     return Thing(tuple(parts), *surface, soft, tuple(shades))
 
 
-def _cover(thing: Thing, shift: Floats, shape: tuple[int, ...]) -> Map:
-    """Share (H, W) of each pixel that an object covers."""
+def _cover(outlines: tuple[Outline, ...], shift: Floats, shape: tuple[int, ...]) -> Map:
+    """Share (H, W) of each pixel that outlines cover."""
     mask, width = np.zeros(shape[:2], np.uint8), shape[1]
-    for kind, points, wide in thing.outlines:
+    for kind, points, wide in outlines:
         places = np.clip(np.rint((points + shift) * width * 16), -(2**15), 2**15).astype(np.int32)
         if kind == "line":
             cv2.polylines(mask, [places], False, 255, max(1, round(wide * width)), cv2.LINE_AA, 4)

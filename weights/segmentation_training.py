@@ -6,7 +6,7 @@ import copy
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,15 @@ from synth.flow.segmentation import CLASSES
 from synth.system import resources
 from weights import paste
 from weights.correction_training import draw_motion, draw_texture
-from weights.networks import SegmentationNet, follow
+from weights.networks import SegmentationNet, follow, read_onnx
 
 _SIZE = 224, 160  # px of examples, width and height
 _PHOTOGRAPH = 384  # px, side of photographs
 _RATE = 4e-3
 _PACE = {"cpu": (4, 12, 48), "cuda": (6, 96, 20_000)}  # examples that a step draws, learns, and chooses from
-_PASTED, _PLAIN, _REST = 0.55, 0.35, 0.4  # chances: of drawn objects, of no render, of objects at rest
-_MARKED = 0.5  # chance that tissue that is no render has lines or patches that look like objects
+_PASTED, _PLAIN, _REST = 0.65, 0.45, 0.4  # chances: of drawn objects, of no render, of objects at rest
+_MARKED = 0.5  # chance that tissue that is no moving render has lines or patches that look like objects
+_VESSELS, _STILL = 0.6, 0.35  # the same of thick vessels; and that this tissue is a rest frame of a render
 _FAR = 0.3  # weight of what is neither tissue nor instrument
 _SHADED = 0.5  # share of the light taken at which a pixel is all shadow
 Example = tuple[Pixels, Pixels, Map, Map]  # frame, rest (H, W, 3) uint8; classes, weights (H, W, 3)
@@ -39,7 +40,7 @@ Example = tuple[Pixels, Pixels, Map, Map]  # frame, rest (H, W, 3) uint8; classe
 def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator) -> Example:
     """A frame, its rest frame, and the classes to be found."""
     if rng.random() < _PLAIN:
-        rest, now, weight = _warped(photographs, rng)
+        rest, now, weight = _warped(sequences, photographs, rng)
     else:
         rest, now, weight = _rendered(sequences[int(rng.integers(len(sequences)))], rng)
     if rng.random() < _PASTED or (now.instrument.max() == 0 and rng.random() < 0.5):
@@ -61,10 +62,12 @@ def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random
 
 def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
     """Layers of rest and a later frame of a sequence, by a random camera, turned and cut; and weights."""
-    right, t = "_right" * bool(rng.random() < 0.5), int(rng.integers(len(one["rgb"])))
+    right = "_right" * bool(rng.random() < 0.5 and "rgb_right" in one)
+    t = int(rng.integers(len(one["rgb"])))
     start = 0 if rng.random() < 0.8 else int(rng.integers(len(one["rgb"])))
     tool, nothing = one["tool" + right][t], np.zeros(one["tissue"].shape, np.float32)
-    shadow = nothing if right else one["shadow"][t] / np.float32(255)
+    is_shadow_known = not right and "shadow" in one
+    shadow = one["shadow"][t] / np.float32(255) if is_shadow_known else nothing
     glare = nothing if right else one["glare"][t].astype(np.float32)
     # The right picture's tissue is not stored: that of the left is near enough for a weight.
     near = np.where(one["tissue"] | tool, 1.0, _FAR).astype(np.float32)
@@ -73,7 +76,8 @@ def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
     mode = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
     now, rest, flat = (cv2.warpAffine(np.asarray(p, np.float32), turn, _SIZE, **mode) for p in planes)
     weight = np.repeat(flat[..., 3:], len(CLASSES), -1)
-    weight[..., 1:3] *= not right
+    weight[..., 1] *= is_shadow_known
+    weight[..., 2] *= not right
     layer = paste.Layer(now, flat[..., 0], flat[..., 1], flat[..., 2])
     return paste.Layer.of(rest), layer, weight
 
@@ -89,22 +93,45 @@ def _turn(shape: tuple[int, ...], rng: np.random.Generator) -> Map:
     return np.column_stack([matrix, np.array(_SIZE) / 2 - matrix @ middle])
 
 
-def _warped(photographs: Sequence[Map], rng: np.random.Generator) -> tuple[Any, Any, Map]:
-    """A photograph or drawn texture as tissue, at rest and moved."""
-    if rng.random() < 0.5:
-        still = _square(photographs, rng)
-    else:
-        still = cv2.resize(draw_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA)
+def _warped(
+    sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator
+) -> tuple[Any, Any, Map]:
+    """A picture as tissue, with what looks like objects but is tissue, at rest and moved; and weights."""
+    picture, is_render = _still(sequences, photographs, rng)
+    still = paste.Layer.of(picture)
     if rng.random() < _MARKED:
         for _ in range(int(rng.integers(1, 4))):
-            thing = paste.draw_marking(rng, still, _square(photographs, rng))
-            still = paste.paste(paste.Layer.of(still), thing, np.zeros(2)).picture
+            thing = paste.draw_marking(rng, still.picture, _square(photographs, rng))
+            still = paste.Layer.of(paste.paste(still, thing, np.zeros(2)).picture)
+    if rng.random() < _VESSELS:
+        still = paste.add_vessels(still, rng)
     size = max(_SIZE)
     flow = cv2.resize(draw_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
     y, x = np.mgrid[: _SIZE[1], : _SIZE[0]].astype(np.float32)
     x, y = x - flow[..., 0], y - flow[..., 1]
-    moved = cv2.remap(still, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    return paste.Layer.of(still), paste.Layer.of(moved), np.ones((*_SIZE[::-1], len(CLASSES)), np.float32)
+    moved, highlight = (
+        cv2.remap(plane, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        for plane in (still.picture, still.highlight)
+    )
+    weight = np.ones((*_SIZE[::-1], len(CLASSES)), np.float32)
+    weight[..., 2] *= not is_render  # its own highlights move otherwise
+    return still, replace(still, picture=moved, highlight=np.clip(highlight, 0, 1)), weight
+
+
+def _still(
+    sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator
+) -> tuple[Map, bool]:
+    """A photograph, drawn texture or rest frame without instruments, and whether it is the last of these."""
+    photograph, kind = _square(photographs, rng), rng.random()
+    if kind < 0.5 * (1 - _STILL):
+        return cv2.resize(draw_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA), False
+    if kind > 1 - _STILL:
+        sequence = sequences[int(rng.integers(len(sequences)))]
+        if not sequence["tool"][0].any():
+            rest = np.asarray(sequence["rgb"][0], np.float32)
+            turn = _turn(rest.shape[:2], rng)
+            return cv2.warpAffine(rest, turn, _SIZE, borderMode=cv2.BORDER_REFLECT_101), True
+    return photograph, False
 
 
 def _square(photographs: Sequence[Map], rng: np.random.Generator) -> Map:
@@ -189,20 +216,29 @@ def batch(examples: Tensor, rng: np.random.Generator) -> tuple[Tensor, ...]:
 
 
 def train(
-    sequences: Sequence[Any], steps: int, seed: int, checkpoint: Path, device: str = "cpu"
+    sequences: Sequence[Any],
+    steps: int,
+    seed: int,
+    checkpoint: Path,
+    device: str = "cpu",
+    start: Path | None = None,
+    pace: float = 1.0,
 ) -> tuple[SegmentationNet, dict[str, Any]]:
     """A network trained for some steps, and its data in numbers; it continues from a checkpoint.
 
     `device`: cpu, or cuda, which learns eight times as many examples in a step, with 9 GB of GPU memory.
+    `start`: weights (ONNX) to start from instead of random ones; `pace`: factor on the learning rate.
     """
     cv2.setNumThreads(0)  # its threads would not survive the fork of the processes that draw
     torch.manual_seed(seed)
     new, count, latest = _PACE[device]
     workers = 1 if device == "cpu" else max(1, resources.cores() - 1)
     net = SegmentationNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    average = copy.deepcopy(net)
-    optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps, pct_start=0.1)
+    if start is not None:
+        read_onnx(net, start)
+    average, rate = copy.deepcopy(net), pace * _RATE
+    optimiser = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps, pct_start=0.1)
     parts: dict[str, Any] = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
     begun, recent, began = 0, deque[Tensor](maxlen=100), time.time()
     if checkpoint.exists():
@@ -242,7 +278,7 @@ def train(
             states = {name: part.state_dict() for name, part in parts.items()}
             torch.save({"step": step + 1} | states, checkpoint.with_suffix(".part"))
             checkpoint.with_suffix(".part").rename(checkpoint)
-    frames = 2 * sum(len(one["rgb"]) for one in sequences)
+    frames = sum(len(one["rgb"]) * (1 + ("rgb_right" in one)) for one in sequences)
     return average.cpu().eval(), {"frames": frames, "steps": steps, "batch": count}
 
 

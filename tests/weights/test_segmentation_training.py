@@ -1,9 +1,11 @@
 """Training of the segmentation."""
 
 import numpy as np
+import torch
 
-from synth.flow import segmentation
+from synth.flow import onnx_network, segmentation
 from weights import segmentation_training
+from weights.networks import SegmentationNet, read_onnx
 
 
 def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes() -> None:
@@ -15,3 +17,11 @@ def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes() 
     assert np.allclose(np.sort(inputs.ravel()), np.sort(segmentation.prepare(frame, rest).ravel()), atol=1e-5)
     light = inputs[0, :3].sum(0)
     assert light[classes[0, 0] == 1].min() > light[weights[0, 0] == 1].max()
+
+
+def test_shipped_weights_are_read_back_for_training() -> None:
+    net = SegmentationNet()
+    read_onnx(net, segmentation.WEIGHTS)
+    planes = np.random.default_rng(0).standard_normal((segmentation.CHANNELS, 64, 96), np.float32)
+    logits = net.eval()(torch.from_numpy(planes)[None])[0].detach().numpy()
+    assert np.allclose(logits, onnx_network.run(segmentation.WEIGHTS, planes), atol=1e-3)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from synth.arrays import Map, Mask, Pixels
+from synth.flow import image
 from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.recording.finding import Finding
 from synth.flow.recording.frame_motion import FrameMotion
@@ -24,7 +25,7 @@ class Limits:
     long: float = 0.12  # least extent of a jump over the width of the picture: more than the rim of a contact
     lost: float = 0.02  # least share of the tissue that an occluder covers
     alike: float = 14.0  # grey levels, change of colour under which what is lost may be tissue that moved far
-    far_px: float = 10.0  # motion from which flow may lose tissue in view
+    far_px: float = 4.0  # motion from which flow may lose tissue in view
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
@@ -77,9 +78,7 @@ class ForegroundSearch:
         doubtful = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
         # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
         whole = cv2.morphologyEx(doubtful.astype(np.uint8), cv2.MORPH_CLOSE, _square(Limits.near_px))
-        lost = np.asarray(whole > 0)
-        if self._is_far(lost, frame):
-            lost = np.zeros_like(lost)
+        lost = self._leave_far(np.asarray(whole > 0), frame)
         self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > Limits.least_px and self._has_masks:  # else it would be that of an instrument
@@ -105,17 +104,26 @@ class ForegroundSearch:
                 found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
 
-    def _is_far(self, lost: Mask, frame: FrameMotion) -> bool:
-        """Whether what is lost (h, w) may be tissue that moved too far for flow: its colours are the rest
-        frame's, and around it tissue moves far."""
-        rest, around = self._rest_rgb, cv2.dilate(lost.astype(np.uint8), _square(Limits.near_px)) > 0
-        if not lost.any() or frame.rgb.shape != rest.shape or not rest.size:
-            return False
-        if not float(np.percentile(np.linalg.norm(frame.flow[around], axis=-1), 90)) > Limits.far_px:
-            return False
+    def _leave_far(self, lost: Mask, frame: FrameMotion) -> Mask:
+        """What is lost (h, w) without what may be tissue that moved too far for flow: tissue moves far around
+        it, and its colours are the rest frame's, there or where flow leads."""
+        rest, now = self._rest_rgb, frame.rgb
+        _, label, stats, _ = cv2.connectedComponentsWithStats(lost.astype(np.uint8))
+        large = stats[:, cv2.CC_STAT_AREA] > Limits.lost * np.count_nonzero(self._tissue)
+        if not large[1:].any() or now.shape != rest.shape or not rest.size:
+            return lost
         side = (2 * Limits.near_px + 1,) * 2
-        now, before = (cv2.blur(picture, side)[lost].astype(np.float32) for picture in (frame.rgb, rest))
-        return float(np.percentile(np.abs(now - before).mean(axis=1), 90)) < Limits.alike
+        moved = cv2.remap(now, *image.ends(frame.flow), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        before, there, along = (cv2.blur(picture, side).astype(np.float32) for picture in (rest, now, moved))
+        changes = [np.abs(after - before).mean(axis=-1) for after in (there, along)]
+        alike, length = np.min(changes, axis=0) < Limits.alike, np.linalg.norm(frame.flow, axis=-1)
+        kept = lost.copy()
+        for k in 1 + np.flatnonzero(large[1:]):
+            part = label == k
+            around = cv2.dilate(part.astype(np.uint8), _square(Limits.near_px)) > 0
+            if np.percentile(length[around], 90) > Limits.far_px:
+                kept &= ~(part & alike)
+        return np.asarray(kept)
 
     def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
         """Notes a detected tool that is wider than tools are and than those at rest."""

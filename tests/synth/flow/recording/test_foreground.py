@@ -79,13 +79,17 @@ def test_what_has_moved_under_a_mask_is_held_by_it_and_an_object_beside_it_is_no
     assert bool(search.findings) is (away_px > 0)
 
 
-@pytest.mark.parametrize("grey", [120, 190])
-def test_tissue_that_flow_loses_as_it_moves_far_is_no_object_and_another_colour_is(grey: int) -> None:
-    rest, lost = np.full((*SHAPE, 3), 120, np.uint8), np.hypot(Y - 60, X - 80) < 25
-    now = np.where(lost[..., None], grey, rest).astype(np.uint8)
+@pytest.mark.parametrize("radius_px", [0, 16, 25])
+@pytest.mark.parametrize("peak_px", [10.0, 25.0])
+def test_tissue_that_flow_loses_as_it_moves_far_is_no_object_and_another_colour_in_it_is(
+    radius_px: int, peak_px: float
+) -> None:
+    away = np.hypot(Y - 60, X - 80)
+    rest, lost = np.full((*SHAPE, 3), 120, np.uint8), away < 25
+    now = np.where(away[..., None] < radius_px, 190, rest).astype(np.uint8)
     search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
     for k in range(4):
         sure = np.where(lost & (k > 0), 0.1, 1).astype(np.float32)
-        motion = min(k, 1) * load(25.0)
+        motion = min(k, 1) * load(peak_px)
         search.add(FrameMotion(motion, sure, is_rest=k == 0, index=k, rgb=now if k else rest))
-    assert bool(search.findings) is (grey > 120)
+    assert bool(search.findings) is (radius_px > 0)
