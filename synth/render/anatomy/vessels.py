@@ -84,8 +84,8 @@ _TWIG_MM = 0.35  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.3  # length over which arterioles and tributaries thin
-_POINTED = 0.02, 0.12  # radius of a free end, and by how much it grows with each mm from there
-_WIDENS = 1.05  # times, at most and besides, from a node to the next one up
+_POINTED = 0.01, 0.03  # radius of a free end, and by how much it grows with each mm from there
+_WIDENS = 1.03  # times, at most and besides, from a node to the next one up
 _WINDING = 0.1, 1.5  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
@@ -112,7 +112,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     rich *= (distance > width + 0.3) | (width < 0.3)
     trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
     deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
-    smooth = _smooth(_pruned(veins, 0.05), 1.0)
+    smooth = _smooth(_pruned(veins, 0.05), 1.8)
     visible = smooth
     for growth in TRIBUTARIES:
         visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
@@ -120,7 +120,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
     beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
     free = (~beside * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)).astype(np.float32)
-    arteries = main = _slender(_smooth(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm), 1.3))
+    arteries = main = _slender(_smooth(_even(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm)), 1.3))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
     arteries = _finished(_without_thorns(arteries), len(main.nodes), _BENT[0], extent_mm, rng)
@@ -142,6 +142,15 @@ def _from_outside(tree: Tree, extent_mm: float) -> Tree:
     """The trunks that enter at the patch's border, or all: a start in mid-field looks like a spindle."""
     kept = ~_inside(tree, extent_mm)[_trunk_of(tree)]
     return _parts(tree, kept) if kept.any() else tree
+
+
+def _even(tree: Tree) -> Tree:
+    """The tree no vessel of which widens away from its root, as beside a start in mid-field."""
+    wide = tree.radius.tolist()
+    for k, up in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
+        if up >= 0:
+            wide[up] = max(wide[up], wide[k])
+    return Tree(tree.nodes, tree.parent, np.array(wide))
 
 
 def _parts(tree: Tree, kept: Mask) -> Tree:
@@ -196,10 +205,10 @@ def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.rand
     thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
     short, long = (
-        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 11.0)
+        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 9.0)
     )
     wide = np.clip(tree.radius / 0.3, 0, 1)
-    radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
+    radius = tree.radius * thinned * np.clip(1 + over(0.12 * short, 0.2 * long, wide), 0.75, 1.3)
     return _pointed(Tree(nodes + supple[:, None] * winding + bent * bends, tree.parent, radius), extent_mm)
 
 
