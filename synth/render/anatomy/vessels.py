@@ -84,7 +84,7 @@ _TWIG_MM = 0.35  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.3  # length over which arterioles and tributaries thin
-_POINTED = 0.01, 0.03  # radius of a free end, and by how much it grows with each mm from there
+_POINTED = 0.008, 0.022  # radius of a free end, and by how much it grows with each mm from there
 _WIDENS = 1.03  # times, at most and besides, from a node to the next one up
 _WINDING = 0.1, 1.5  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
@@ -112,7 +112,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     rich *= (distance > width + 0.3) | (width < 0.3)
     trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
     deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
-    smooth = _smooth(_pruned(veins, 0.05), 1.8)
+    smooth = _smooth(_pruned(veins, 0.05), 1.6)
     visible = smooth
     for growth in TRIBUTARIES:
         visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
@@ -160,11 +160,14 @@ def _parts(tree: Tree, kept: Mask) -> Tree:
 
 
 def _smooth(tree: Tree, over_mm: float) -> Tree:
-    """The tree with centre lines and radii smoothed over a length; its ends stay."""
+    """The tree with centre lines and radii smoothed over a length; its ends stay.
+
+    Springs of r^4, stiffer than at growth: no side branch bends its trunk into an elbow.
+    """
     length = np.hypot(*(tree.nodes - tree.nodes[tree.parent])[tree.parent >= 0].T)
     rounds = round(2 * (over_mm / max(float(np.mean(length)), 0.02)) ** 2)
     spread = np.column_stack([tree.nodes, np.log(tree.radius)])
-    spread = relaxed(spread, tree.parent, tree.radius, 1e-3, rounds)
+    spread = relaxed(spread, tree.parent, tree.radius**2, 1e-3, rounds)
     return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
 
 
@@ -194,7 +197,7 @@ def _inside(tree: Tree, extent_mm: float) -> Mask:
 
 def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.random.Generator) -> Tree:
     """The tree whose nodes from number `main` on have grown in, made to wind and bend, and thinned."""
-    nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, _ROUNDED)
+    nodes = relaxed(tree.nodes, tree.parent, tree.radius**2, 1e-3, _ROUNDED)
     shift, wave = _WINDING
     winding, bends = (
         np.stack([noise.sample(noise.band(rng, 256, extent_mm, w, 0.5), nodes, extent_mm) for _ in "xy"], 1)
