@@ -32,6 +32,7 @@ _LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
 _CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
 _STREAKS = 1.3, 0.16  # of blood along a shaft: wavelength across it, mm, as a share of that along it
+_BROAD_MM = 1.2  # half the width of a shaft from which on they are wider
 _SMEARED = 0.75, 30.0  # blood on coats: level of the noise from which it is smeared, to mm from the tip
 _SERRATION_MM = 0.5, 5.0, 0.45  # of forceps' inner faces: start, end, and period along the tip;
 _NOTCHED = 0.3, 0.025  # light that a notch takes, and its depth, mm
@@ -75,6 +76,7 @@ class _Texels:
     place: Map  # (h, w, 3) mm
     along: Map  # mm from its tip, or from a sheet's border
     turned: Map  # by how much its outline turns more than a circle's, see `_edges`
+    flat: Map  # (w,) share of bumps and brushing that show: little where it narrows to its tip
     half_mm: float  # half its width
     blotch: Map
     mottle: Map
@@ -155,8 +157,14 @@ def _lay_out(
     wide = float(np.linalg.norm(place[-1] - place[0], axis=-1)[: size[1] // 3].max())
     blotch = noise(place, 8.0 if sheet_rows else max(2.5, 0.8 * wide), rng)
     mottle, grain = noise(place, 1.1, rng), noise(place, 0.35, rng)
-    lines = grain if sheet_rows else _lines(place, rng)
-    return _Texels(kind, bool(sheet_rows), place, along, turned, 0.5 * wide, blotch, mottle, grain, lines)
+    across = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1).cumsum(axis=0)
+    full = across[-1] / across[-1, : size[1] // 2].max()
+    lines = grain if sheet_rows else _lines(across, rng)
+    # Where a bar narrows to its tip, the texture's rows run apart, and bumps along them would show its faces.
+    flat = np.ones_like(full) if sheet_rows else step(1.6 * full - 0.9)
+    return _Texels(
+        kind, bool(sheet_rows), place, along, turned, flat, 0.5 * wide, blotch, mottle, grain, lines
+    )
 
 
 def _body(finish: Finish, texels: _Texels) -> _Layers:
@@ -167,11 +175,13 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     edge = step(texels.turned - 0.8) * (not kind.startswith(("finger", *CLOTH)))
     coat = step((along - finish.bare_mm) / 0.06) * (1 - worn)
     bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn) + 0.004 * coat * mottle
-    bumps = bumps + 0.0012 * (1 - coat) * lines * (1 + 8 * finish.brushed)
+    bumps = bumps + 0.0012 * (1 - coat) * texels.flat * lines * (1 + 8 * finish.brushed)
     if kind == "spatula":  # no blade is flat: it is hollowed by rolling, and bent in use
-        bumps = bumps + (_WARP * texels.blotch + _HOLLOW * texels.half_mm * texels.across**2) * (1 - coat)
+        hollow = _HOLLOW * texels.half_mm * texels.across**2 * texels.flat
+        bumps = bumps + (_WARP * texels.blotch + hollow) * (1 - coat)
     rub = np.exp((0.1 + 0.8 * finish.brushed) * lines)
-    rough = np.stack([finish.alpha * max(finish.streak, 1.0) * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
+    streak = 1 + (max(finish.streak, 1.0) - 1) * texels.flat
+    rough = np.stack([finish.alpha * streak * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
     rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn)
     bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
     base = np.asarray(finish.mirror, np.float32) * bright[..., None]
@@ -214,7 +224,7 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     """
     if not finish.blood:
         return layers
-    streak = texels.blotch if texels.sheet else _streaks(texels.place, rng)
+    streak = texels.blotch if texels.sheet else _streaks(texels, rng)
     uneven = 0.5 * streak + 0.25 * min(1.0, texels.half_mm / 3) * texels.blotch
     uneven = uneven + 0.1 * (texels.mottle if texels.sheet else texels.lines)
     tip = 0.5 * np.exp(-texels.along / 1.5) * (not texels.sheet)
@@ -277,14 +287,16 @@ def _texels(grid: Floats, size: tuple[int, int], rows: Floats | None = None) -> 
     return np.asarray(cv2.remap(np.ascontiguousarray(grid, np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
-def _lines(place: Map, rng: np.random.Generator) -> Map:
-    """Lines (h, w) along a part of texels at places (h, w, 3) mm, each of some length, unit variance."""
-    height, width = place.shape[:2]
+def _lines(across: Map, rng: np.random.Generator) -> Map:
+    """Lines (h, w) along a part, each of some length, unit variance.
+
+    `across`: (h, w) mm from its one side.
+    """
+    height, width = across.shape
     coarse = rng.normal(size=(height, 12)).astype(np.float32)
     lines = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     lines = cv2.GaussianBlur(lines, (1, 0), sigmaX=1e-3, sigmaY=_LINES_PX)  # as wide as the picture resolves
     # They are parallel in space: where a bar narrows to its tip, the outer ones end.
-    across = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1).cumsum(axis=0)
     row = (across - across[height // 2]) / np.maximum(across[-1], across[-1, : width // 2].max())
     row = ((height - 1) * row + height // 2).astype(np.float32)
     column = np.broadcast_to(np.arange(width, dtype=np.float32), row.shape)
@@ -292,10 +304,11 @@ def _lines(place: Map, rng: np.random.Generator) -> Map:
     return np.asarray(lines / lines.std(), np.float32)
 
 
-def _streaks(place: Map, rng: np.random.Generator) -> Map:
-    """Noise (h, w) of unit variance on texels at places (h, w, 3) mm, long along a part."""
-    wave, short = _STREAKS
-    coarse = noise(place[::2, ::4] * np.array((1, 1, short), np.float32), wave, rng)
+def _streaks(texels: _Texels, rng: np.random.Generator) -> Map:
+    """Noise (h, w) of unit variance, long along a part, and wide on wide ones."""
+    (wave, short), place = _STREAKS, texels.place
+    wide = max(1.0, texels.half_mm / _BROAD_MM)
+    coarse = noise(place[::2, ::4] * np.array((1, 1, short * wide), np.float32), wave * wide, rng)
     return np.asarray(cv2.resize(coarse, place.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
 
 

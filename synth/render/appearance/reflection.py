@@ -22,7 +22,7 @@ _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
 _SHADED = 0.8  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
-_DARKER = 0.55, 2.5  # of that share, what is lost where it touches, and the height over which less is, mm
+_DARKER = 0.65, 3.5  # of that share, what is lost where it touches, and the height over which less is, mm
 _GRAZING = 5.0, 0.4  # rise of the reflectance of plastic and steel at grazing angles, less by roughness
 _TWICE = 1.25  # where light arrives that tissue has scattered before: a power of its colour
 
