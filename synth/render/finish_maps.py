@@ -33,7 +33,11 @@ _STEEPEST = 1.0  # slope of bumps
 _CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
 _STREAKS = 1.3, 0.16  # of blood along a shaft: wavelength across it, mm, as a share of that along it
 _BROAD_MM = 1.2  # half the width of a shaft from which on they are wider
-_SMEARED = 0.75, 30.0  # blood on coats: level of the noise from which it is smeared, to mm from the tip
+_SMEARED = (
+    0.75,
+    30.0,
+    0.35,
+)  # blood wiped along it: level of the noise from which it is, to mm from the tip; its depth
 _SERRATION_MM = 0.5, 5.0, 0.45  # of forceps' inner faces: start, end, and period along the tip;
 _NOTCHED = 0.3, 0.025  # light that a notch takes, and its depth, mm
 _BORE_RINGS = 5.2  # rings of a tube that are inside
@@ -229,11 +233,12 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     uneven = uneven + 0.1 * (texels.mottle if texels.sheet else texels.lines)
     tip = 0.5 * np.exp(-texels.along / 1.5) * (not texels.sheet)
     share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven + tip
-    shown_to = step((1.3 * finish.blood_mm + 1.5 * streak - texels.along) / 2)
+    ragged = texels.along + 0.25 * finish.blood_mm * np.clip(1 - streak, 0, 2)
+    shown_to = step((1.3 * finish.blood_mm - ragged) / 2)
     deep = np.clip(share / 0.9 + 0.2, 0, 1.4) * shown_to
-    level, reach = _SMEARED
+    level, reach, thin = _SMEARED
     wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
-    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, 0.9) * min(1, 3 * finish.blood) * (not texels.sheet))
+    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5)
     edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
     smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]

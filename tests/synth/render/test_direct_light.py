@@ -75,6 +75,23 @@ def test_noise_along_a_soft_shadow_falls() -> None:
     check_denoised(exact, before, after)
 
 
+@pytest.mark.parametrize("spp", [4, 64])
+def test_tissue_scatters_light_into_shadows_and_steel_does_not(spp: int) -> None:
+    """Left half in shadow; a bar of steel across both: it stays, tissue gains most red."""
+    shade = np.zeros((64, 64), np.float32)
+    shade[:, :32] = 1
+    steel, none = np.zeros_like(shade), np.zeros_like(shade)
+    steel[24:40] = 1
+    blocked = np.stack([0.6 * shade] * 3)
+    light = Light(0.6 - blocked, 0 * blocked, none, blocked, shade, none + 1, none, steel)
+    plain, soft = soften(light, spp), soften(light, spp, 0.1)
+    np.testing.assert_array_equal(soft[25:39], plain[25:39])
+    gain = (soft - plain)[8]
+    assert (gain[29:32] > 0.01).all()
+    assert (gain[32:35] < -0.01).all()
+    assert gain[26, 0] > 1.5 * gain[26, 1] >= gain[26, 2] > 0
+
+
 def test_noise_falls_where_a_wide_rim_crosses_a_shadow() -> None:
     """Under two unequal lamps, each sampled by half of a pixel's paths; not below what texture adds."""
     rng, before, after = np.random.default_rng(5), [], []
