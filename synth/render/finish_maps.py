@@ -31,8 +31,15 @@ _BLOOD_MM = 0.025  # height of a film of blood
 _LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
 _CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
-_SMEARED = 0.55, 30.0  # blood on coats: level of the noise from which it is smeared, to mm from the tip
-_SERRATION_MM = 0.5, 5.5, 0.38  # of forceps' inner faces: start, end, and period along the tip
+_STREAKS = 1.3, 0.16  # of blood along a shaft: wavelength across it, mm, as a share of that along it
+_BROAD_MM = 1.2  # half the width of a shaft from which on they are wider
+_SMEARED = (
+    0.75,
+    30.0,
+    0.35,
+)  # blood wiped along it: level of the noise from which it is, to mm from the tip; its depth
+_SERRATION_MM = 0.5, 5.0, 0.45  # of forceps' inner faces: start, end, and period along the tip;
+_NOTCHED = 0.3, 0.025  # light that a notch takes, and its depth, mm
 _BORE_RINGS = 5.2  # rings of a tube that are inside
 _DROPS = 1.2  # mean number of drops of water, per mm under water
 _DROPS_MM = 8.0  # from the tip to where they end
@@ -73,6 +80,7 @@ class _Texels:
     place: Map  # (h, w, 3) mm
     along: Map  # mm from its tip, or from a sheet's border
     turned: Map  # by how much its outline turns more than a circle's, see `_edges`
+    flat: Map  # (w,) share of bumps and brushing that show: little where it narrows to its tip
     half_mm: float  # half its width
     blotch: Map
     mottle: Map
@@ -111,7 +119,7 @@ def paint(
     `turn`: as of `unfold`; `mm_per_px`: of the picture, as fine as which they are.
     """
     texels = _lay_out(profile, sheet_rows, turn, kind, rng, mm_per_px)
-    layers = _wetted(finish, texels, _bloodied(finish, texels, _body(finish, texels)), rng)
+    layers = _wetted(finish, texels, _bloodied(finish, texels, _body(finish, texels), rng), rng)
     base, mirror, bumps, rough = layers.base, layers.mirror, layers.bumps, np.clip(layers.rough, 0.05, 1)
     if kind in ("suction", "tube"):
         width = texels.along.shape[1]
@@ -153,11 +161,14 @@ def _lay_out(
     wide = float(np.linalg.norm(place[-1] - place[0], axis=-1)[: size[1] // 3].max())
     blotch = noise(place, 8.0 if sheet_rows else max(2.5, 0.8 * wide), rng)
     mottle, grain = noise(place, 1.1, rng), noise(place, 0.35, rng)
-    # Lines end where a bar narrows to its tip.
-    width = np.linalg.norm(np.gradient(place, axis=0), axis=-1).sum(axis=0)
-    fade = step(1.6 * width / width[: size[1] // 2].max() - 0.9)
-    lines = grain if sheet_rows else fade * _lines(size, rng)
-    return _Texels(kind, bool(sheet_rows), place, along, turned, 0.5 * wide, blotch, mottle, grain, lines)
+    across = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1).cumsum(axis=0)
+    full = across[-1] / across[-1, : size[1] // 2].max()
+    lines = grain if sheet_rows else _lines(across, rng)
+    # Where a bar narrows to its tip, the texture's rows run apart, and bumps along them would show its faces.
+    flat = np.ones_like(full) if sheet_rows else step(1.6 * full - 0.9)
+    return _Texels(
+        kind, bool(sheet_rows), place, along, turned, flat, 0.5 * wide, blotch, mottle, grain, lines
+    )
 
 
 def _body(finish: Finish, texels: _Texels) -> _Layers:
@@ -168,11 +179,13 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     edge = step(texels.turned - 0.8) * (not kind.startswith(("finger", *CLOTH)))
     coat = step((along - finish.bare_mm) / 0.06) * (1 - worn)
     bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn) + 0.004 * coat * mottle
-    bumps = bumps + 0.0012 * (1 - coat) * lines * (1 + 8 * finish.brushed)
+    bumps = bumps + 0.0012 * (1 - coat) * texels.flat * lines * (1 + 8 * finish.brushed)
     if kind == "spatula":  # no blade is flat: it is hollowed by rolling, and bent in use
-        bumps = bumps + (_WARP * texels.blotch + _HOLLOW * texels.half_mm * texels.across**2) * (1 - coat)
+        hollow = _HOLLOW * texels.half_mm * texels.across**2 * texels.flat
+        bumps = bumps + (_WARP * texels.blotch + hollow) * (1 - coat)
     rub = np.exp((0.1 + 0.8 * finish.brushed) * lines)
-    rough = np.stack([finish.alpha * max(finish.streak, 1.0) * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
+    streak = 1 + (max(finish.streak, 1.0) - 1) * texels.flat
+    rough = np.stack([finish.alpha * streak * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
     rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn)
     bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
     base = np.asarray(finish.mirror, np.float32) * bright[..., None]
@@ -195,9 +208,11 @@ def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map
     if texels.kind in ("forceps", "bayonet"):
         start, end, period = _SERRATION_MM
         teeth = step((along - start) / 0.3) * step((end - along) / 0.6) * (1 - coat)
-        inner = step((np.abs(texels.across) - 0.62) / 0.3)
-        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 3 * teeth * inner
-        return base * (1 - 0.75 * notch[..., None]), bumps - 0.06 * notch
+        outwards = np.sign(texels.place[:, -1, 0].mean())  # a tine is bowed away from the other one
+        inner = step((-outwards * texels.across - 0.62) / 0.3)
+        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 2 * teeth * inner
+        dark, deep = _NOTCHED
+        return base * (1 - dark * notch[..., None]), bumps - deep * notch
     if texels.kind in ("dissector", "suction"):
         every, apart, width = _MARKS_MM
         ring = np.mod(along - 0.5 * every, every)
@@ -206,15 +221,24 @@ def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map
     return base, bumps
 
 
-def _bloodied(finish: Finish, texels: _Texels, layers: _Layers) -> _Layers:
-    """With blood: a film that is brightest red where it is thin, a clot where it is thick, and its border."""
-    uneven = 0.55 * texels.blotch + 0.14 * texels.mottle
-    share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven
-    shown_to = step((1.3 * finish.blood_mm - texels.along) / 2) * (finish.blood > 0)
+def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
+    """With blood: a film that is brightest red where it is thin, a clot where it is thick, and its border.
+
+    It has run and been wiped along a shaft.
+    """
+    if not finish.blood:
+        return layers
+    streak = texels.blotch if texels.sheet else _streaks(texels, rng)
+    uneven = 0.5 * streak + 0.25 * min(1.0, texels.half_mm / 3) * texels.blotch
+    uneven = uneven + 0.1 * (texels.mottle if texels.sheet else texels.lines)
+    tip = 0.5 * np.exp(-texels.along / 1.5) * (not texels.sheet)
+    share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven + tip
+    ragged = texels.along + 0.25 * finish.blood_mm * np.clip(1 - streak, 0, 2)
+    shown_to = step((1.3 * finish.blood_mm - ragged) / 2)
     deep = np.clip(share / 0.9 + 0.2, 0, 1.4) * shown_to
-    level, reach = _SMEARED
-    wiped = 0.6 * texels.blotch + 0.35 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
-    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, 0.9) * min(1, 3 * finish.blood) * (not texels.sheet))
+    level, reach, thin = _SMEARED
+    wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
+    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5)
     edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
     smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]
@@ -268,12 +292,29 @@ def _texels(grid: Floats, size: tuple[int, int], rows: Floats | None = None) -> 
     return np.asarray(cv2.remap(np.ascontiguousarray(grid, np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
-def _lines(size: tuple[int, int], rng: np.random.Generator) -> Map:
-    """Lines (h, w) along a part, each of some length, unit variance."""
-    coarse = rng.normal(size=(size[0], 12)).astype(np.float32)
-    lines = cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_LINEAR)
+def _lines(across: Map, rng: np.random.Generator) -> Map:
+    """Lines (h, w) along a part, each of some length, unit variance.
+
+    `across`: (h, w) mm from its one side.
+    """
+    height, width = across.shape
+    coarse = rng.normal(size=(height, 12)).astype(np.float32)
+    lines = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     lines = cv2.GaussianBlur(lines, (1, 0), sigmaX=1e-3, sigmaY=_LINES_PX)  # as wide as the picture resolves
+    # They are parallel in space: where a bar narrows to its tip, the outer ones end.
+    row = (across - across[height // 2]) / np.maximum(across[-1], across[-1, : width // 2].max())
+    row = ((height - 1) * row + height // 2).astype(np.float32)
+    column = np.broadcast_to(np.arange(width, dtype=np.float32), row.shape)
+    lines = cv2.remap(lines, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return np.asarray(lines / lines.std(), np.float32)
+
+
+def _streaks(texels: _Texels, rng: np.random.Generator) -> Map:
+    """Noise (h, w) of unit variance, long along a part, and wide on wide ones."""
+    (wave, short), place = _STREAKS, texels.place
+    wide = max(1.0, texels.half_mm / _BROAD_MM)
+    coarse = noise(place[::2, ::4] * np.array((1, 1, short * wide), np.float32), wave * wide, rng)
+    return np.asarray(cv2.resize(coarse, place.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def _drops(place: Map, along: Map, finish: Finish, rng: np.random.Generator) -> Map:
@@ -292,7 +333,7 @@ def _drops(place: Map, along: Map, finish: Finish, rng: np.random.Generator) -> 
         turn = np.arctan2(away[..., 1], away[..., 2]) + rng.uniform(0, 2 * np.pi)
         ragged = radius * (1 + 0.25 * np.cos(2 * turn) + 0.12 * np.cos(3 * turn + 1))
         away2 = (away**2).sum(axis=-1) / ragged**2
-        high[:, near] = np.maximum(high[:, near], _FLAT * radius * np.sqrt(np.clip(1.3 * (1 - away2), 0, 1)))
+        high[:, near] = np.maximum(high[:, near], _FLAT * radius * np.clip(1 - away2, 0, 1))
     return high
 
 

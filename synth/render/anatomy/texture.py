@@ -75,6 +75,7 @@ class Artery:
     opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.74, 0.16, 0.085)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
+    crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
     rim_dark: Rgb = (0.35, 0.8, 0.7)  # absorption
     covered: tuple[float, float] = 0.95, 0.28  # of its redness along it, by the arachnoid: mean, and spread
@@ -90,6 +91,7 @@ class Vein:
     crest: float = 0.5  # of a thick one's radius: width of its bluish crest
     rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
     rim_dark: Rgb = (1.1, 1.5, 1.15)  # absorption
+    mottle: float = 0.14  # standard deviation of its wall's albedo, as a share of it
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
     level: float = 0.97  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
@@ -201,7 +203,8 @@ def _paint_rows(appearance: Appearance, *maps: Map) -> tuple[Map]:
     """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 5 of veins, 3 of arteries."""
     tissue = _with_clefts(appearance, _parenchyma(appearance, *maps[:6]), sulci=maps[2], strands=maps[6])
     veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:13])
-    return (_with_arteries(appearance, veined, *maps[13:]),)
+    crossed = maps[9] * step((0.85 - maps[8]) / 0.3)  # wide veins, over which arteries run
+    return (_with_arteries(appearance, veined, crossed, *maps[13:]),)
 
 
 def _parenchyma(
@@ -277,7 +280,8 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     across = np.asarray(np.clip(distance / np.maximum(radius, 1e-3), 0, 1), np.float32)
     start, span = Vein.wide
     thick = np.clip((radius - start) / span, 0, 1)
-    along = cv2.resize(noise.band(rng, 96, extent, 9.0, 0.6), size)
+    mottled = 0.8 * noise.band(rng, 96, extent, 9.0, 0.6) + 0.6 * noise.band(rng, 96, extent, 2.4, 0.5)
+    along = cv2.resize(mottled, size)
     cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.09, extent)
     margin = noise.blur(((across < 1) * thick).astype(np.float32), Vein.margin, extent)
     return [across, thick, along, cover, margin]
@@ -291,14 +295,18 @@ def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
     middle, width = Vein.rim
+    wall = wall * (1 + Vein.mottle * along)[..., None]
     wall = through(wall, thick * ridge(across, width=width, at=middle), Vein.rim_dark)
     # Some stretches lie deeper, under the arachnoid.
     cover = (cover * np.clip(0.95 + 0.25 * np.minimum(along + 0.6, 0), 0.55, 0.97))[..., None]
     return np.asarray(over(through(albedo, 1.7 * margin, Vein.margin_dark), wall, cover), np.float32)
 
 
-def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map, radius: Map) -> Map:
-    """Albedo (r, n, 3) of some rows with their arteries, in a red that varies with the noise `wide`."""
+def _with_arteries(
+    appearance: Appearance, albedo: Map, crossed: Map, wide: Map, distance: Map, radius: Map
+) -> Map:
+    """Albedo (r, n, 3) of some rows with their arteries, in a red that varies with the noise `wide`; where
+    dark veins are `crossed`, only their walls are seen."""
     chord = thickness((distance, radius))
     most, soon = Artery.opaque
     reach = most * (1 - np.exp(-chord / soon)) + 0.08 * chord
@@ -307,7 +315,9 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
     red = through(albedo, appearance.arterial_absorption * reach * fade, Artery.absorption_per_mm)
     # The wall of a wide artery scatters light itself, most along the crest.
     start, span = Artery.wide
-    thick = np.clip((radius - start) / span, 0, 1) * (distance < radius)
+    thick = np.maximum(np.clip((radius - start) / span, 0, 1), Artery.crossing * crossed) * (
+        distance < radius
+    )
     across = distance / np.maximum(radius, 1e-3)
     wall = np.array(Artery.wall, np.float32) * (0.7 + 0.4 * ridge(across, width=0.55))[..., None]
     walled = red + (0.55 * thick * np.clip(fade, 0, 1))[..., None] * (wall - red)

@@ -84,8 +84,8 @@ _TWIG_MM = 0.35  # shorter side branches are left out: they look like thorns
 _ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.3  # length over which arterioles and tributaries thin
-_POINTED = 0.02, 0.12  # radius of a free end, and by how much it grows with each mm from there
-_WIDENS = 1.05  # times, at most and besides, from a node to the next one up
+_POINTED = 0.008, 0.022  # radius of a free end, and by how much it grows with each mm from there
+_WIDENS = 1.03  # times, at most and besides, from a node to the next one up
 _WINDING = 0.1, 1.5  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
@@ -112,7 +112,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     rich *= (distance > width + 0.3) | (width < 0.3)
     trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
     deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
-    smooth = _smooth(_pruned(veins, 0.05), 1.0)
+    smooth = _smooth(_pruned(veins, 0.05), 1.6)
     visible = smooth
     for growth in TRIBUTARIES:
         visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
@@ -120,7 +120,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
     beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
     free = (~beside * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)).astype(np.float32)
-    arteries = main = _slender(_smooth(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm), 1.3))
+    arteries = main = _slender(_smooth(_even(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm)), 1.3))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
     arteries = _finished(_without_thorns(arteries), len(main.nodes), _BENT[0], extent_mm, rng)
@@ -144,6 +144,15 @@ def _from_outside(tree: Tree, extent_mm: float) -> Tree:
     return _parts(tree, kept) if kept.any() else tree
 
 
+def _even(tree: Tree) -> Tree:
+    """The tree no vessel of which widens away from its root, as beside a start in mid-field."""
+    wide = tree.radius.tolist()
+    for k, up in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
+        if up >= 0:
+            wide[up] = max(wide[up], wide[k])
+    return Tree(tree.nodes, tree.parent, np.array(wide))
+
+
 def _parts(tree: Tree, kept: Mask) -> Tree:
     """The tree of the nodes (N,) that are kept, which includes the parent of each."""
     number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
@@ -151,11 +160,14 @@ def _parts(tree: Tree, kept: Mask) -> Tree:
 
 
 def _smooth(tree: Tree, over_mm: float) -> Tree:
-    """The tree with centre lines and radii smoothed over a length; its ends stay."""
+    """The tree with centre lines and radii smoothed over a length; its ends stay.
+
+    Springs of r^4, stiffer than at growth: no side branch bends its trunk into an elbow.
+    """
     length = np.hypot(*(tree.nodes - tree.nodes[tree.parent])[tree.parent >= 0].T)
     rounds = round(2 * (over_mm / max(float(np.mean(length)), 0.02)) ** 2)
     spread = np.column_stack([tree.nodes, np.log(tree.radius)])
-    spread = relaxed(spread, tree.parent, tree.radius, 1e-3, rounds)
+    spread = relaxed(spread, tree.parent, tree.radius**2, 1e-3, rounds)
     return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
 
 
@@ -185,7 +197,7 @@ def _inside(tree: Tree, extent_mm: float) -> Mask:
 
 def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.random.Generator) -> Tree:
     """The tree whose nodes from number `main` on have grown in, made to wind and bend, and thinned."""
-    nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, _ROUNDED)
+    nodes = relaxed(tree.nodes, tree.parent, tree.radius**2, 1e-3, _ROUNDED)
     shift, wave = _WINDING
     winding, bends = (
         np.stack([noise.sample(noise.band(rng, 256, extent_mm, w, 0.5), nodes, extent_mm) for _ in "xy"], 1)
@@ -196,10 +208,10 @@ def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.rand
     thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
     short, long = (
-        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 11.0)
+        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 9.0)
     )
     wide = np.clip(tree.radius / 0.3, 0, 1)
-    radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
+    radius = tree.radius * thinned * np.clip(1 + over(0.12 * short, 0.2 * long, wide), 0.75, 1.3)
     return _pointed(Tree(nodes + supple[:, None] * winding + bent * bends, tree.parent, radius), extent_mm)
 
 

@@ -21,9 +21,10 @@ _PANELS = (0.4, 1.7, 2.9, 4.2, 5.3), 0.2, 1.5  # windows and light boxes: azimut
 _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
-_SHADED = 0.75  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
-_GRAZING = 12.0, 0.4  # rise of the reflectance of plastic and steel at grazing angles, less by roughness
-_TWICE = 1.7  # where light arrives that tissue has scattered before: a power of its colour
+_SHADED = 0.8  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
+_DARKER = 0.65, 3.5  # of that share, what is lost where it touches, and the height over which less is, mm
+_GRAZING = 5.0, 0.4  # rise of the reflectance of plastic and steel at grazing angles, less by roughness
+_TWICE = 1.25  # where light arrives that tissue has scattered before: a power of its colour
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Thea
     wound = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in theatre.blurred], axis=-1)
     edge = (np.linalg.norm(met, axis=1) - _FADE_MM) / (3.0 + 0.6 * width)
     lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
-    ground = lit * _SHADED * wound**_TWICE + (1 - lit) * _DRAPE
+    lost, low = _DARKER
+    shaded = _SHADED * (1 - lost * np.exp(-np.maximum(place[:, 2:], 0.0) / low))
+    ground = lit * shaded * wound**_TWICE + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1)
     above = (1 - high) * _DRAPE + high * _CEILING + _panels(direction, spread)[:, None]
     return np.asarray(below * ground + (1 - below) * above)

@@ -30,6 +30,7 @@ class Light(NamedTuple):
     shade: Map  # (H, W) irradiance that shadows take from them
     arrive: Map  # (H, W) their irradiance without shadows, of the lamps that they sampled
     radius: Map  # (H, W) px: cover times the radius of the circle of confusion
+    steel: Map  # (H, W) share of the paths that end on other steel
 
 
 def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, seed: int) -> Light:
@@ -47,7 +48,7 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
     shift = dr.opaque(mi.UInt32, int(np.ceil(np.log2(spp))))
     found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
     number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
-    sums = [dr.zeros(mi.Float, width * height) for _ in range(13)]
+    sums = [dr.zeros(mi.Float, width * height) for _ in range(14)]
     for before in range(0, spp, _AT_ONCE):
         count = min(spp - before, _AT_ONCE)
         first, paths = (dr.opaque(mi.UInt32, whole) for whole in (before, count))
@@ -67,9 +68,11 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
         radiance = si.emitter(scene).eval(si) + dr.select(shadow, 0, scattered)
         depth = dr.dot(si.p - lens.centre, lens.rows[2])
         blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
-        near = hit & (blur > _BLURRED_PX) & (dr.reinterpret_array(mi.UInt32, si.shape) == number)
+        steel = hit & (dr.reinterpret_array(mi.UInt32, si.shape) == number)
+        near = steel & (blur > _BLURRED_PX)
         parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1)))]
         parts += [(shadow & ~near, (*scattered, weight.y)), (hit & ~near, (weight.y,)), (near, (blur,))]
+        parts += [(steel & ~near, (mi.Float(1),))]
         for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
             dr.scatter_add(total, value, pixel, where)
         dr.eval(sums)

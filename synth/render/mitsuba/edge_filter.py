@@ -24,7 +24,7 @@ _ENOUGH = 16  # paths per pixel from which on nothing is filtered
 _SIGMA_PX = 1.5  # of the smoothing before and after slopes are taken
 _FLAT = np.float32(1e-4)  # squared slope per pixel below which there is no edge
 _LEAST = np.float32(1e-6)
-_TRAVELLED_MM = 0.45, 0.18, 0.15  # by light in tissue, farthest in red: standard deviations, by eye
+_TRAVELLED_MM = 0.36, 0.19, 0.15  # by light in tissue, farthest in red: standard deviations, by eye
 
 
 def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
@@ -36,7 +36,7 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
     if spp >= _ENOUGH:
         picture = np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
         clear = cv2.merge([*(light.radiance - light.near + light.blocked)])
-        return picture + _scattered(light.shade, light.arrive, clear, sigmas)
+        return picture + _scattered(light, light.shade, light.arrive, clear, sigmas)
     every = light.near, light.radiance - light.near, light.blocked
     near, behind, blocked = (cv2.merge([*part]) for part in every)
     cover, arrive, bare = light.cover, light.arrive, 1 - light.cover
@@ -58,7 +58,7 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
         # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
         most = np.minimum(4 * total * arrive / np.maximum(dull * bright, _LEAST), 1)
         gain = most * (light.shade / np.maximum(arrive, _LEAST) - shade / np.maximum(total, _LEAST))
-        scattered = _scattered(shade, total, most[..., None] * clear, sigmas)
+        scattered = _scattered(light, shade, total, most[..., None] * clear, sigmas)
         behind = np.maximum(behind + gain[..., None] * clear + scattered, 0)
     picture = np.ascontiguousarray(near + behind)
     if cover.any():
@@ -71,23 +71,29 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
     return picture
 
 
-def _scattered(shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -> Map:
+def _scattered(light: Light, shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -> Map:
     """Radiance (H, W, 3) that shadows gain, or light beside them loses, by the blur of irradiance in tissue.
 
     `shade` of the irradiance `arrive` (H, W) is blocked; without it the radiance is `clear` (H, W, 3);
-    `sigmas`: of the blur in each channel, px.
+    `sigmas`: of the blur in each channel, px. Steel neither gains nor gives.
     """
     if not any(sigmas):
         return np.zeros_like(clear)
-    both = cv2.merge([shade, arrive])
+    tissue = (light.steel == 0).astype(np.float32)
+    both = cv2.merge([shade * tissue, arrive * tissue])
     small = cv2.resize(both, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     sharp = shade / np.maximum(arrive, _LEAST)
+    # Where steel covers a part of a pixel, what is blocked there is the tissue's.
+    y, x = np.nonzero((light.steel > 0) & (light.steel < 1 - light.cover - _LEAST))
     gained = []
-    for sigma in sigmas:
+    for channel, sigma in enumerate(sigmas):
         blurred = cv2.GaussianBlur(small, (0, 0), 0.5 * sigma)
         part = blurred[..., 0] / np.maximum(blurred[..., 1], _LEAST)
-        gained.append(sharp - cv2.resize(part, sharp.shape[::-1]))
-    return np.asarray(cv2.merge(gained) * clear, np.float32)
+        part = cv2.resize(part, sharp.shape[::-1])
+        plane = (sharp - part) * clear[..., channel] * tissue
+        plane[y, x] = (1 - part[y, x]) * light.blocked[channel, y, x]
+        gained.append(plane)
+    return np.asarray(cv2.merge(gained), np.float32)
 
 
 def _covered(near: Map, behind: Map, cover: Map, radius: Map) -> Map:

@@ -51,7 +51,7 @@ def test_noise_along_a_soft_edge_falls_and_what_lies_behind_keeps_its_pixels() -
         radiance = np.stack([0.1 * cover + ground * (1 - cover)] * 3).astype(np.float32)
         near = np.stack([0.1 * cover] * 3).astype(np.float32)
         share = cover.astype(np.float32)
-        light = Light(radiance, near, share, np.zeros_like(radiance), none, 1 - share, 3 * share)
+        light = Light(radiance, near, share, np.zeros_like(radiance), none, 1 - share, 3 * share, none)
         truth = 0.1 * exact + ground * (1 - exact)
         before.append(radiance[0] - truth)
         after.append(soften(light, 4)[..., 0] - truth)
@@ -67,10 +67,29 @@ def test_noise_along_a_soft_shadow_falls() -> None:
         exact, shade = soft_edge(64, rng)
         blocked = np.stack([0.6 * shade] * 3).astype(np.float32)
         clear = none + np.float32(2)
-        light = Light(0.6 - blocked, 0 * blocked, none, blocked, 2 * shade.astype(np.float32), clear, none)
+        light = Light(
+            0.6 - blocked, 0 * blocked, none, blocked, 2 * shade.astype(np.float32), clear, none, none
+        )
         before.append(light.radiance[0] - 0.6 * (1 - exact))
         after.append(soften(light, 4)[..., 0] - 0.6 * (1 - exact))
     check_denoised(exact, before, after)
+
+
+@pytest.mark.parametrize("spp", [4, 64])
+def test_tissue_scatters_light_into_shadows_and_steel_does_not(spp: int) -> None:
+    """Left half in shadow; a bar of steel across both: it stays, tissue gains most red."""
+    shade = np.zeros((64, 64), np.float32)
+    shade[:, :32] = 1
+    steel, none = np.zeros_like(shade), np.zeros_like(shade)
+    steel[24:40] = 1
+    blocked = np.stack([0.6 * shade] * 3)
+    light = Light(0.6 - blocked, 0 * blocked, none, blocked, shade, none + 1, none, steel)
+    plain, soft = soften(light, spp), soften(light, spp, 0.1)
+    np.testing.assert_array_equal(soft[25:39], plain[25:39])
+    gain = (soft - plain)[8]
+    assert (gain[29:32] > 0.01).all()
+    assert (gain[32:35] < -0.01).all()
+    assert gain[26, 0] > 1.5 * gain[26, 1] >= gain[26, 2] > 0
 
 
 def test_noise_falls_where_a_wide_rim_crosses_a_shadow() -> None:
@@ -87,7 +106,7 @@ def test_noise_falls_where_a_wide_rim_crosses_a_shadow() -> None:
         cover, arrive, shade = (part.mean(axis=0) for part in (near, ~near * lamp, (~near & shaded) * lamp))
         parts = [0.1 * cover + ground * (arrive - shade), 0.1 * cover], [ground * shade]
         (radiance, object_), (blocked,) = ([np.stack([one] * 3) for one in group] for group in parts)
-        every = radiance, object_, cover, blocked, shade, arrive, 12 * cover
+        every = radiance, object_, cover, blocked, shade, arrive, 12 * cover, 0 * cover
         light = Light(*(one.astype(np.float32) for one in every))
         before.append(light.radiance[0])
         after.append(soften(light, 4)[..., 0])

@@ -14,7 +14,7 @@ from synth.render import finish, idle, instrument
 from synth.render.anatomy import surface
 from synth.render.anatomy.chart import Chart, places, unroll
 from synth.render.anatomy.colonisation import Growth, fill
-from synth.render.anatomy.tree import Tree, lattice, least_cost, relaxed
+from synth.render.anatomy.tree import Tree, lattice, least_cost, relaxed, remaining
 from synth.render.appearance.reflection import Theatre, glow
 from synth.render.materials import FinishMaps, Metal, read_map, stack_maps
 from synth.sequence import scenario
@@ -87,6 +87,16 @@ def test_vessels_are_joined_thin_out_and_follow_murray() -> None:
     tips = np.bincount(arteries.parent + 1, minlength=len(arteries.parent) + 1)[1:] == 0
     assert np.median(arteries.radius[tips]) < 0.02
     assert 0.01 < np.median(arteries.radius) < 0.04  # arterioles of 20-80 um
+
+
+def test_arteries_thin_over_millimetres_to_where_they_end() -> None:
+    """No blunt stumps: within a millimetre of a free end inside the patch all are fine, within three thin."""
+    made = surface.grow(scenario.draw_relief(AnatomySection(), np.random.default_rng(3)))
+    tree = made.vessels.arteries
+    left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
+    inside = np.abs(tree.nodes).max(axis=1) < 0.3 * made.chart.extent_mm
+    for within, most in ((0.5, 0.03), (1.0, 0.06), (3.0, 0.2)):
+        assert tree.radius[inside & (left < within)].max() < most
 
 
 def test_a_vessel_of_least_cost_shares_its_way() -> None:
@@ -216,6 +226,27 @@ def test_finishes_are_as_drawn() -> None:
     red = bloody[:, 0] > 3 * bloody[:, 1]
     assert 0.2 < red[along < 5].mean() <= 1
     assert not red[along > 8].any()
+
+
+def test_blood_runs_along_a_shaft() -> None:
+    """A film's borders are several times as many across a thin tine as along it, in equal lengths."""
+    rng, (bar, _) = np.random.default_rng(0), instrument.shape_of("forceps", 1.0)[0]
+    bare = finish.Finish((0.6, 0.6, 0.6), 0.2)
+    changes = np.zeros(2)
+    for _ in range(12):
+        maps = bar.maps(replace(bare, blood=0.45, blood_mm=5.0), "forceps", rng, 0.05)
+        film = maps.wet > 0.5
+        columns = np.linspace(0, len(bar.profile) // 32 - 1, film.shape[1])
+        along = np.interp(columns, np.arange(len(bar.profile) // 32), bar.profile[::32, 2])
+        shown = (along > 0.8) & (along < 4.0)
+        shape = film[:, shown]
+        wide = np.ptp(bar.profile[:, :2][(bar.profile[:, 2] > 0.8) & (bar.profile[:, 2] < 4.0)], axis=0).sum()
+        length = np.ptp(along[shown])
+        changes += [
+            (shape[1:] != shape[:-1]).sum() / shape.shape[1] / wide,
+            (shape[:, 1:] != shape[:, :-1]).sum() / shape.shape[0] / length,
+        ]
+    assert changes[0] > 2 * changes[1] > 0
 
 
 def test_stacked_maps_keep_each_bodys_texels() -> None:
