@@ -29,9 +29,9 @@ _SMALL = ("render.size=[256, 192]",)
 DATASETS: Mapping[str, tuple[str, ...]] = {
     "mission": ("mission", "sequences=240"),
     "mission-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80"),
-    "gap-mission": ("mission", "sequences=255", *_ONE_CAMERA),
+    "gap-mission": ("mission", "sequences=375", *_ONE_CAMERA),
     "gap-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80", *_ONE_CAMERA),
-    "gap-clinical": ("clinical", "sequences=120", "frames=8", "fps=2.5", *_SMALL),
+    "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", *_SMALL),
     "paper": (
         "paper",
         "sequences=90",
