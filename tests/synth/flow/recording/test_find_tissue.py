@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from synth.flow.recording.decode import Footage, RecordingFlowSettings
-from synth.flow.recording.find_tissue import touches_border
+from synth.flow.recording.find_tissue import TissueSearch, touches_border
+from synth.flow.recording.frame_motion import FrameMotion, RestFrame
 from synth.flow.recording.video_track import track_video
 from synth.video.read_video import Picture
 from tests.synth.flow.recording.test_camera_motion import EVERYWHERE, OPENING, X, Y, texture
@@ -57,6 +58,27 @@ def test_a_blob_is_held_back() -> None:
     assert last.rest.tissue.mean() < 0.05
     assert [one.severity for one in last.rest.findings] == ["error"]
     assert "tissue.png" in last.rest.findings[0].message
+
+
+def test_a_part_that_an_instrument_cuts_off_and_often_hides_belongs_to_the_tissue() -> None:
+    rng = np.random.default_rng(0)
+    rgb = texture(X, Y) * np.array([1.0, 0.7, 0.6])
+    rgb[~OPENING] = (texture(Y, X) * np.array([0.6, 0.8, 1.0]))[~OPENING]
+    blade = (X > 72) & (X < 86) & (Y < 120)
+    rgb[blade] = 150
+    picture = np.clip(rgb + rng.normal(0, 1, rgb.shape), 0, 255).astype(np.uint8)
+    search = TissueSearch(RestFrame(picture, EVERYWHERE, X.shape, 1, 0.0, ""))
+    still = np.zeros((*X.shape, 2), np.float32)
+    sure = np.where(blade, 0, 0.99).astype(np.float32)
+    search.add(FrameMotion(still, sure, is_rest=True, masked=blade))
+    for frame in range(10):
+        flow = np.stack([3 * (frame + 1) / 10 * RIM + 0.3 * OPENING, 0 * RIM], -1).astype(np.float32)
+        left = OPENING & (X <= 72)
+        known = np.where(left & (frame % 2 == 0), 0.1, sure).astype(np.float32)  # lost in every other frame
+        search.add(FrameMotion(flow, known, masked=blade))
+    tissue, finding = search.find()
+    assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.85
+    assert finding.severity == "missing"
 
 
 def test_the_border_of_the_picture_is_no_edge() -> None:
