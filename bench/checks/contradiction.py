@@ -83,11 +83,11 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
     """The finding on a sensor that contradicts the leading method, with the likeliest causes."""
     if sensor.is_constant:
         return []
-    found = _check_hypotheses(sensor)
-    if sensor.pulsates or any(finding.cause == "clocks" for finding in found):
-        return found
+    findings = _check_hypotheses(sensor)
+    if sensor.pulsates or any(finding.cause == "clocks" for finding in findings):
+        return findings
     edges = check_edges(sensor)
-    return found + (edges or ([] if found else check_unsensed(sensor)))
+    return findings + (edges or ([] if findings else check_unsensed(sensor)))
 
 
 def check_edges(sensor: SensorMotion) -> list[Finding]:
@@ -107,15 +107,13 @@ def check_edges(sensor: SensorMotion) -> list[Finding]:
     k = int(np.argmax(lost_s))
     if min(off_s, apart_s) < max(0.5 * frame_s, 0.5 * _EDGE_S):
         if apart_s < off_s and abs(rate - 1) > _RATE and np.abs(late_s).max() > 2 * frame_s:
-            what = (
-                f"contacts begin and end {rate:.3g} times as late in the video as in the sensor's record: a "
-            )
-            what += f"clock or the video is stamped with another rate (sync.rate {rate:.3f})"
+            times = f"{rate:.3g} times as late in the video as in the sensor's record"
+            stamped = f"a clock or the video is stamped with another rate (sync.rate {rate:.3f})"
+            what = f"contacts begin and end {times}: {stamped}"
         elif abs(offset_s) > max(1.5 * frame_s, 2 * _EDGE_S):
-            what = (
-                f"contacts begin and end {abs(offset_s):.2f} s {'later' if offset_s > 0 else 'earlier'} in "
-            )
-            what += f"the video than in the sensor's record: add {offset_s:+.2f} s (sync.offset_s)"
+            when = f"{abs(offset_s):.2f} s {'later' if offset_s > 0 else 'earlier'}"
+            add = f"add {offset_s:+.2f} s (sync.offset_s)"
+            what = f"contacts begin and end {when} in the video than in the sensor's record: {add}"
     elif lost_s[k] > max(2 * frame_s, 2 * _EDGE_S) and late_s[2 * k] < max(0.5 * frame_s, 0.5 * _EDGE_S):
         what = f"a contact ends {lost_s[k]:.2f} s earlier in the video than in the sensor's record: are "
         what += f"pictures missing between {moved[2 * k]:.2f} and {moved[2 * k + 1]:.2f} s?"
@@ -140,10 +138,9 @@ def check_unsensed(sensor: SensorMotion) -> list[Finding]:
     # What isn't released within the video may be the camera's motion.
     if len(run) < 2 or low[run[0] :].min() > _UNSENSED * most_mn:
         return []
-    what = (
-        f"from {sensor.time_s[run[0]]:.2f} to {sensor.time_s[run[-1]]:.2f} s the video shows a force of at "
-    )
-    what += f"least {low[run].max():.2g} mN, but the sensor none: is there a contact that it doesn't hold?"
+    span = f"from {sensor.time_s[run[0]]:.2f} to {sensor.time_s[run[-1]]:.2f} s"
+    shown = f"the video shows a force of at least {low[run].max():.2g} mN, but the sensor none"
+    what = f"{span} {shown}: is there a contact that it doesn't hold?"
     return [Finding("warning", "sensor", what)]
 
 

@@ -57,7 +57,7 @@ class TVL1Settings:
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
-    better: float = 0.1  # see `follow`: change of agreement over which it turns; 0: no flow is a last frame's
+    better: float = 0.1  # see `follow`: change of agreement over which it turns
     large_px: float = 2.0  # there: length from which motion is large
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
@@ -113,14 +113,14 @@ class Tvl1:
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
         levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
         if initial is not None:
-            found = (follow if s.better > 0 else solve)(levels, initial, s)
+            flow = follow(levels, initial, s)
         elif len(levels) > 1:
-            found = solve(levels[: s.fine_levels], finer(guess(levels[1:], s), levels[0]), s)
+            flow = solve(levels[: s.fine_levels], finer(guess(levels[1:], s), levels[0]), s)
         else:
-            found = solve(levels, None, s)
-        found = steadied(found, s.steady_px)
-        warped, visible = image.warp(levels[0].now, levels[0].now_usable, found)
-        return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
+            flow = solve(levels, None, s)
+        flow = steadied(flow, s.steady_px)
+        warped, visible = image.warp(levels[0].now, levels[0].now_usable, flow)
+        return flow, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
 
 def pyramid(grey: Map, usable: Map, s: TVL1Settings) -> list[tuple[Map, Map]]:

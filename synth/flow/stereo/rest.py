@@ -85,5 +85,7 @@ def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start
     initial = np.stack([-start, np.zeros_like(start)])
     pictures = np.ascontiguousarray(left), np.ascontiguousarray(right)
     usable = flags(left_usable), flags(right_usable)
-    flow, trust, _ = Tvl1(TVL1Settings(better=0.0), corrected=False).uncorrected(*pictures, *usable, initial)
+    # A disparity isn't the flow of a frame before: it is smoothed as a whole.
+    settings = TVL1Settings(large_px=np.inf)
+    flow, trust, _ = Tvl1(settings, corrected=False).uncorrected(*pictures, *usable, initial)
     return flow, trust
