@@ -43,10 +43,10 @@ class Status:
         return bool(self.needs) and not self.moved
 
     def describe(self) -> str:
-        """`stands`, `moved: flow 0.8% (confidence)` or `old`, and `times of DATE`."""
+        """`stands`, `out of date, ...: flow 0.8% (confidence)` or `old`, and `times of DATE`."""
         state = "stands" if self.stands else "old: made before the guard, or without probes"
         if self.moved:
-            state = "moved since it was made: " + ", ".join(change.text() for change in self.moved)
+            state = "out of date, as these have changed: " + ", ".join(one.text() for one in self.moved)
         return f"{state}; times are of {self.date or 'an unknown date'}" if self.timed else state
 
     def row(self) -> dict[str, Any]:

@@ -28,7 +28,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
-_NAMED = "tiny, demo, mission, randomized, stereo, in-vivo, ex-vivo-calf, endoscope, paper"
+_NAMED = "tiny, demo, mission, clinical, randomized, stereo, flow, in-vivo, ex-vivo-calf, endoscope, paper"
 Source = Annotated[str, Argument(help=f"A job file, or a named job: {_NAMED}.")]
 Overrides = Annotated[list[str] | None, Argument(help="Changes to the job, as section.key=value.")]
 Out = Annotated[Path, Argument(help="A dataset's folder.")]

@@ -222,7 +222,7 @@ class Meta(Section):
     """Range of the tissue's Poisson's ratio."""
     alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)
     """Range of the exponent of Ogden's law, by which tissue stiffens where two cameras see it strained beyond
-    some 30%: of swine -4.7, of human brain about -20 (docs/howto/law.md), of soft gels about 2."""
+    some 30%: of swine -4.7, of human brain about -20 (docs/science.md), of soft gels about 2."""
     fps: Positive | None = None
     """Frames per second, for frames/*.png without frames.csv."""
     start: Literal["picture", "file"] = "picture"

@@ -1,4 +1,4 @@
-"""`bench.score` and `bench score`: from a recording to score.json and score_report.html."""
+"""`bench.score` and `bench score`: from a recording to score.json and report.html."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from synth.system import checked_file
 from synth.system.terminal import counting
 
 Settings = RecordingFlowSettings  # public name
-_OUTPUT_BYTES = 32 << 20  # for score.json and score_report.html
+_OUTPUT_BYTES = 32 << 20  # for score.json and report.html
 _LONG = 100  # frames from which a second process is worth the seconds that it takes to start
 
 
@@ -56,7 +56,7 @@ def score(
         methods: further methods by name; without a model the result is about the first.
         baselines: whether physics and the plug-ins' methods are scored too.
         settings: flow back end, rate, masks; None: the command's defaults.
-        out: folder for score.json and score_report.html, which are written together.
+        out: folder for score.json and report.html, which are written together.
         title: heading of the report.
         progress: whether a progress bar is shown, in a terminal or a notebook.
         own_process: whether the flow of a long recording is computed in another process, which imports the
@@ -134,7 +134,7 @@ def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
 
 
 def write_result(result: Result, folder: Path, title: str) -> None:
-    """Writes score.json and score_report.html; neither has its name before both are complete."""
+    """Writes score.json and report.html; neither has its name before both are complete."""
     with (
         checked_file.part_of(folder / "score.json") as scores,
         checked_file.part_of(folder / "report.html") as page,

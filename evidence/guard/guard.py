@@ -48,7 +48,8 @@ class Change:
 
     def text(self) -> str:
         """`flow 0.8% (confidence)`."""
-        size = "another shape" if math.isinf(self.relative) else f"{100 * self.relative:.2g}%"
+        percent = 100 * self.relative
+        size = "another shape" if math.isinf(percent) else f"{percent:{'.0f' if percent >= 10 else '.2g'}}%"
         return f"{self.probe} {size} ({self.array})"
 
 
