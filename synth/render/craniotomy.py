@@ -99,8 +99,9 @@ def craniotomy(
     if how.surroundings is None:
         if "retractor" in appearance.scenery:
             static.append(scenery.build_retractor(how.scale * around.edge, theatre, ground, seed, px))
-        if "clips" in appearance.scenery:
-            static += scenery.build_clips(around, how.scale, theatre, ground, seed, camera)
+        for name, objects in scenery.ALONG_RIM.items():
+            if name in appearance.scenery:
+                static += objects(around, how.scale, theatre, ground, seed, camera)
     hand = np.random.default_rng([seed, 2])
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),

@@ -488,7 +488,7 @@ def _muscle(
     colour = over(colour, sheet, white[..., None])
     fat = Wound.fatty * step(wide - 0.9 + 0.5 * mottle + 0.2 * bundles)
     colour = over(colour, np.asarray(Wound.fat, np.float32), fat[..., None])
-    return colour, (0.035 - 0.015 * white) * bundles
+    return colour, (0.022 - 0.012 * white) * bundles
 
 
 def _with_bone(
@@ -538,7 +538,7 @@ def _with_skin(
     pale = through(pale, stained + 0.35 * pore, Wound.blood)
     bumps = 0.012 * grain - 0.015 * pore
     colour = over(colour, pale, skin[..., None])
-    return colour, over(relief + 0.1 * grain * fat, bumps, np.maximum(skin, dermis)), skin
+    return colour, over(relief + 0.02 * grain * fat, bumps, np.maximum(skin, dermis)), skin
 
 
 def _draped(
