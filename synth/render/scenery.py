@@ -135,11 +135,11 @@ def build_patties(
         cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
         part = instrument.lay_cloth(cloth, ground, rng)
         (vertices,) = instrument.place([part], *cloth.at(0.0))
-        felt = replace(draw_finish(0.0, rng, "patty"), blood=float(rng.uniform(0.1, 0.75)), blood_mm=half)
+        felt = replace(draw_finish(0.0, rng, "patty"), blood=float(rng.uniform(0.05, 0.5)), blood_mm=0.6 * half)
         maps = part.maps(felt, "patty", rng, camera.mm_per_px)
         sheet = Shape(vertices, part.shape.faces)
         bodies.append(_body(sheet, part.uv, maps, theatre, np.full(len(vertices), 0.9)))
-        start, curl = middle + 0.9 * half * lean, rng.normal(0, 0.25, 2)
+        start, curl = middle + 0.9 * half * lean, rng.normal(0, 0.5, 2)
         s = np.linspace(0, 1, 18)[:, None]
         side = np.array([-lean[1], lean[0], 0.0])
         flat = start + 16 * s * lean + side * (16 * (curl[0] * s**2 + 0.3 * curl[1] * np.sin(2 * np.pi * s)))
