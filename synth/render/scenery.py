@@ -135,7 +135,7 @@ def build_patties(
         cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
         part = instrument.lay_cloth(cloth, ground, rng)
         (vertices,) = instrument.place([part], *cloth.at(0.0))
-        felt = replace(draw_finish(0.0, rng, "patty"), blood=float(rng.uniform(0.05, 0.5)), blood_mm=0.6 * half)
+        felt = replace(draw_finish(0.0, rng, "patty"), blood=float(rng.uniform(0.05, 0.38)), blood_mm=0.6 * half)
         maps = part.maps(felt, "patty", rng, camera.mm_per_px)
         sheet = Shape(vertices, part.shape.faces)
         bodies.append(_body(sheet, part.uv, maps, theatre, np.full(len(vertices), 0.9)))

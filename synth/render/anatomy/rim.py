@@ -127,9 +127,10 @@ class Skin:
     clipped: tuple[float, float] = 1.6, 0.5  # where clips hold it,
     boned: float = 2.6  # and by how much farther behind bone
     albedo: Rgb = (0.70, 0.46, 0.33)
-    fat: Rgb = (0.80, 0.58, 0.30)  # in lobules
+    fat: Rgb = (0.82, 0.60, 0.36)  # in lobules
     dermis: Rgb = (0.80, 0.56, 0.46)
     width: tuple[float, float] = 0.9, 0.3  # of the fat, and of the dermis over it
+    stain: Rgb = (0.3, 1.2, 1.35)  # absorption of blood on the fat
     roll: float = 0.8  # height of the edge
 
 
@@ -279,7 +280,7 @@ def paint(rim: Rim, appearance: Appearance, pixels: int, seen: Mask | None = Non
         partial(_paint_rows, rim, appearance, streaks), where, (0.2, 0.0, 0.5), *maps
     )
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    return Coat(colour, normals(noise.blur(bumps, 0.08, extent), extent), dry)
+    return Coat(colour, normals(noise.blur(bumps, 0.11, extent), extent), dry)
 
 
 def _fine(rng: np.random.Generator, pixels: int, extent_mm: float) -> Map:
@@ -473,8 +474,8 @@ def _soaked(level: float, uneven: Map) -> Map:
 def _bundles(streaks: Map, turn: float, x: Map, y: Map, wide: Map, mottle: Map) -> Map:
     """Bundles of fibres along one direction, at an angle `turn` rad: noise (512, 512) drawn out."""
     across, along = Wound.bundles
-    u = (across * (np.cos(turn) * x + np.sin(turn) * y) + 14 * wide).astype(np.float32) % 512
-    v = (along * (np.cos(turn) * y - np.sin(turn) * x) + 6 * mottle).astype(np.float32) % 512
+    u = (across * (np.cos(turn) * x + np.sin(turn) * y) + 6 * wide).astype(np.float32) % 512
+    v = (along * (np.cos(turn) * y - np.sin(turn) * x) + mottle).astype(np.float32) % 512
     return np.asarray(cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
 
 
@@ -484,7 +485,7 @@ def _muscle(
     """Albedo (r, n, 3) and bumps (r, n) mm of muscle, partly under its fascia, with fat in places."""
     colour = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.3 * bundles, 0.08 * fine)
     sheet = speckled(Wound.fascia, 0.14 * bundles, 0.05 * mottle, 0.06 * fine)
-    white = 0.85 * step((0.5 * bundles - 0.9 * spilt - 0.55) / 0.6)
+    white = 0.85 * step((0.4 * bundles - 0.9 * spilt - 0.5) / 1.1)
     colour = over(colour, sheet, white[..., None])
     fat = Wound.fatty * step(wide - 0.9 + 0.5 * mottle + 0.2 * bundles)
     colour = over(colour, np.asarray(Wound.fat, np.float32), fat[..., None])
@@ -528,7 +529,7 @@ def _with_skin(
     dermis = step((place + thick) / 0.15) * (1 - skin)
     colour, relief = below
     yellow = through(
-        speckled(Skin.fat, 0.12 * grain, 0.06 * mottle), np.clip(0.9 * blood + 0.35 * mottle, 0, 0.9), Wound.blood
+        speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), np.clip(0.35 + 0.5 * blood + 0.2 * mottle, 0.1, 0.8), Skin.stain
     )
     colour = over(colour, yellow, fat[..., None])
     colour = over(colour, speckled(Skin.dermis, 0.06 * mottle, 0.04 * fine), 0.8 * dermis[..., None])
@@ -538,7 +539,7 @@ def _with_skin(
     pale = through(pale, stained + 0.35 * pore, Wound.blood)
     bumps = 0.012 * grain - 0.015 * pore
     colour = over(colour, pale, skin[..., None])
-    return colour, over(relief + 0.02 * grain * fat, bumps, np.maximum(skin, dermis)), skin
+    return colour, over(relief * (1 - fat) + 0.03 * grain * fat, bumps, np.maximum(skin, dermis)), skin
 
 
 def _draped(
