@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from synth.arrays import Floats, Map
-from synth.geometry.triangles import Shape, joined
+from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render import instrument
 from synth.render.anatomy.layers import Rgb
 from synth.render.anatomy.rim import Rim
@@ -86,7 +86,7 @@ def build_clips(
             skin = Finish(
                 (0.6, 0.6, 0.6), 0.3, coat=colour, coat_alpha=0.16, bare_mm=-1.0, blood=blood, blood_mm=6.0
             )
-            bars.append(_Bar(part, middle + (s[:, None] - 0.5) * along, skin, "clip"))
+            bars.append(_Bar(part, 16, middle + (s[:, None] - 0.5) * along, skin, "clip"))
     return _bodies(bars, theatre, rng, 1.5 * camera.mm_per_px)
 
 
@@ -113,7 +113,7 @@ def build_hooks(
         path = np.concatenate([arc, far])
         steel = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood=float(rng.uniform(0, 0.4)))
         part = _wire(path, _HOOK_MM)
-        bars.append(_Bar(part, path, replace(steel, blood_mm=4.0), "hook"))
+        bars.append(_Bar(part, 8, path, replace(steel, blood_mm=4.0), "hook"))
     return _bodies(bars, theatre, rng, camera.mm_per_px)
 
 
@@ -146,7 +146,7 @@ def build_patties(
         path = np.stack([_rest(ground, point, 0.35) for point in flat])
         path[:, 2] = gaussian_filter1d(path[:, 2], 1.0, mode="nearest") + 0.15
         thread = Finish((0.5, 0.5, 0.5), 0.5, coat=string, coat_alpha=0.5, bare_mm=-1.0)
-        bars.append(_Bar(_wire(path, _STRING_MM), path, thread, "string"))
+        bars.append(_Bar(_wire(path, _STRING_MM), 4, path, thread, "string"))
     return bodies + _bodies(bars, theatre, rng, 2 * camera.mm_per_px)
 
 
@@ -163,6 +163,7 @@ class _Bar:
     """A bar of rings along a path."""
 
     part: Part  # straight
+    sides: int  # of its cross-section, of a part's `RING`
     path: Floats  # (R, 3) mm: middles of its rings
     finish: Finish
     kind: str
@@ -177,9 +178,14 @@ class _Bar:
         mean = aside.sum(axis=0) / max(float(np.linalg.norm(aside.sum(axis=0))), 1e-9)
         aside = np.where(level > 0.1, aside / np.maximum(level, 1e-9), mean)
         up = np.cross(ahead, aside)
-        rings = self.part.profile.reshape(len(self.path), RING, 3)
+        rings = self.part.profile.reshape(len(self.path), RING, 3)[:, :: RING // self.sides]
         placed = self.path[:, None] + rings[..., :1] * up[:, None] + rings[..., 1:2] * aside[:, None]
-        return Shape(placed.reshape(-1, 3), self.part.shape.faces)
+        return Shape(placed.reshape(-1, 3), grid_faces(len(rings), self.sides, "columns").reshape(-1, 3))
+
+    @property
+    def uv(self) -> Map:
+        places = self.part.uv.reshape(len(self.path), RING, 2)[:, :: RING // self.sides]
+        return np.ascontiguousarray(places.reshape(-1, 2))
 
 
 def _bodies(bars: list[_Bar], theatre: Theatre, rng: np.random.Generator, mm_per_px: float) -> list[Body]:
@@ -187,9 +193,9 @@ def _bodies(bars: list[_Bar], theatre: Theatre, rng: np.random.Generator, mm_per
     if not bars:
         return []
     whole = joined(*(bar.shape for bar in bars))
-    textures = [(bar.part.uv, bar.part.maps(bar.finish, bar.kind, rng, mm_per_px)) for bar in bars]
+    textures = [(bar.uv, bar.part.maps(bar.finish, bar.kind, rng, mm_per_px)) for bar in bars]
     uv, maps = stack_maps(textures)
-    alpha = np.concatenate([np.full(len(bar.part.profile), bar.finish.alpha) for bar in bars])
+    alpha = np.concatenate([np.full(len(bar.uv), bar.finish.alpha) for bar in bars])
     return [_body(whole, uv, maps, theatre, alpha)]
 
 

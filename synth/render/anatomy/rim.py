@@ -409,7 +409,7 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     bundles = _bundles(streaks, float(rim.stitches[0]), x, y, wide, mottle)
     beyond, relief = _muscle(appearance, bundles, wide, mottle, spilt, fine)
     beyond = through(beyond, 0.25 * soaked, Wound.blood)
-    wiped = np.clip(0.5 * bundles + 0.7 * wide + 1.2 * appearance.blood - 1.2, 0, 1.2)
+    wiped = np.clip(0.3 * bundles + 0.8 * wide + 0.15 * mottle + 1.2 * appearance.blood - 1.2, 0, 1.2)
     tight = np.zeros_like(away)  # share of bone and skin, which soak up no fluid
     if rim.bone:
         beyond, relief, tight = _with_bone(
@@ -476,7 +476,8 @@ def _bundles(streaks: Map, turn: float, x: Map, y: Map, wide: Map, mottle: Map) 
     across, along = Wound.bundles
     u = (across * (np.cos(turn) * x + np.sin(turn) * y) + 6 * wide).astype(np.float32) % 512
     v = (along * (np.cos(turn) * y - np.sin(turn) * x) + mottle).astype(np.float32) % 512
-    return np.asarray(cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
+    noisy = cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(np.clip(noisy, -1.5, 2.0), np.float32)
 
 
 def _muscle(
@@ -525,11 +526,12 @@ def _with_skin(
     place = past + 0.12 * mottle
     skin = step(place / 0.2)
     thick = thick * np.clip(1 + 0.9 * wiped - 0.6 * mottle, 0.2, 2)
+    lobules = lobules * np.clip(1 + 0.9 * wiped - 0.5 * mottle, 0.1, 2)
     fat = step((place + thick + lobules) / 0.4) * step(-(place + thick) / 0.15)
     dermis = step((place + thick) / 0.15) * (1 - skin)
     colour, relief = below
     yellow = through(
-        speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), np.clip(0.35 + 0.5 * blood + 0.2 * mottle, 0.1, 0.8), Skin.stain
+        speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), np.clip(0.1 + 0.5 * blood + 0.3 * mottle, 0.05, 0.9), Skin.stain
     )
     colour = over(colour, yellow, fat[..., None])
     colour = over(colour, speckled(Skin.dermis, 0.06 * mottle, 0.04 * fine), 0.8 * dermis[..., None])
