@@ -90,8 +90,8 @@ class RenderSection(Section):
     true and recovered; 0: monocular."""
     scenery: tuple[Scenery, ...] = ("retractor", "bone", "drape", "clips", "hooks", "patties")
     """Objects around the opening, each in a share of the sequences: a retractor's blade over its edge (30%),
-    the bone's cut edge (50%), drapes in the corners (40%), clips (55%) and hooks (30%) on the cut skin, patties
-    of cotton on the rim (35%). They hide tissue and don't count as tissue."""
+    the bone's cut edge (50%), drapes in the corners (40%), clips (55%) and hooks (30%) on the cut skin,
+    patties of cotton on the rim (35%). They hide tissue and don't count as tissue."""
 
     @model_validator(mode="after")
     def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:

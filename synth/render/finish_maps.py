@@ -221,9 +221,7 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
 
 
-def _moulded(
-    finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map
-) -> tuple[Map, Map]:
+def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map) -> tuple[Map, Map]:
     """Albedo and bumps of a coat on a round shaft, with the collar in which it begins.
 
     The microscope's lamps are next to its lens, so that a shaft is darker towards its sides and glints along

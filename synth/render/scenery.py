@@ -28,6 +28,7 @@ from synth.render.materials import Body, FinishMaps, Metal, read_map, stack_maps
 _DULL = Finish(  # a retractor's, darkened against glare
     (0.38, 0.365, 0.35), 0.2, 2.0, scattered=0.05, wear=0.35, blood=0.3, blood_mm=5.0, wet_mm=3.0
 )
+_WIRE = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood_mm=4.0)
 _CLIP_MM = 3.4, 2.1  # length along the skin's edge and radius
 _GROUPS, _TOGETHER = (3, 6), (2, 4)  # clips: numbers of groups, and in each
 _GAP_MM, _BEHIND_MM = 1.2, 0.5  # between two, and from the skin's edge
@@ -109,11 +110,10 @@ def build_hooks(
         start = foot + 0.6 * out
         high = max(float(crest[2] - foot[2]), 0.8)
         arc = start + 1.1 * np.sin(bend) * out + [0, 0, 1] * (high * np.cos(bend) - 0.1)
-        far = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * (out + [0, 0, 0.12])
+        far = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * np.array([*out[:2], 0.12])
         path = np.concatenate([arc, far])
-        steel = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood=float(rng.uniform(0, 0.4)))
-        part = _wire(path, _HOOK_MM)
-        bars.append(_Bar(part, 8, path, replace(steel, blood_mm=4.0), "hook"))
+        steel = replace(_WIRE, blood=float(rng.uniform(0, 0.4)))
+        bars.append(_Bar(_wire(path, _HOOK_MM), 8, path, steel, "hook"))
     return _bodies(bars, theatre, rng, camera.mm_per_px)
 
 
@@ -135,7 +135,8 @@ def build_patties(
         cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
         part = instrument.lay_cloth(cloth, ground, rng)
         (vertices,) = instrument.place([part], *cloth.at(0.0))
-        felt = replace(draw_finish(0.0, rng, "patty"), blood=float(rng.uniform(0.05, 0.38)), blood_mm=0.6 * half)
+        soaked = float(rng.uniform(0.05, 0.38))
+        felt = replace(draw_finish(0.0, rng, "patty"), blood=soaked, blood_mm=0.6 * half)
         maps = part.maps(felt, "patty", rng, camera.mm_per_px)
         sheet = Shape(vertices, part.shape.faces)
         bodies.append(_body(sheet, part.uv, maps, theatre, np.full(len(vertices), 0.9)))
@@ -173,11 +174,11 @@ class _Bar:
         ahead = np.gradient(self.path, axis=0)
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
         # Upwards where it is level, so that the shown half of its texture faces the microscope.
-        aside = np.cross([0.0, 0.0, 1.0], ahead)
+        aside = np.cross(ahead, [0.0, 0.0, 1.0])
         level = np.linalg.norm(aside, axis=1, keepdims=True)
         mean = aside.sum(axis=0) / max(float(np.linalg.norm(aside.sum(axis=0))), 1e-9)
         aside = np.where(level > 0.1, aside / np.maximum(level, 1e-9), mean)
-        up = np.cross(ahead, aside)
+        up = np.cross(aside, ahead)
         rings = self.part.profile.reshape(len(self.path), RING, 3)[:, :: RING // self.sides]
         placed = self.path[:, None] + rings[..., :1] * up[:, None] + rings[..., 1:2] * aside[:, None]
         return Shape(placed.reshape(-1, 3), grid_faces(len(rings), self.sides, "columns").reshape(-1, 3))

@@ -52,7 +52,7 @@ def in_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...
 def in_part(
     paint: Callable[..., tuple[Map, ...]], where: Indices, rest: tuple[float, ...], *maps: Map
 ) -> tuple[Map, ...]:
-    """As `in_rows`, of the pixels (M,) `where` alone, which count row by row; others are filled with `rest`."""
+    """As `in_rows`, of the pixels (M,) `where` alone, counted row by row; others are filled with `rest`."""
     flat = [image.reshape(-1, *image.shape[2:]) for image in maps]
     painted = list[Map]()
     for start in range(0, len(where), _CHUNK):

@@ -147,10 +147,10 @@ class Bone:
 
 
 class Drape:
-    """Surgical drapes: distance behind the wall's foot [mm], and albedos; plain cloth or a film of plastic."""
+    """Surgical drapes: distance behind the wall's foot [mm], and albedos."""
 
-    away: tuple[float, float] = 3.0, 0.8  # mean and spread; at least
-    beyond: float = 1.2  # beyond the skin's edge
+    away: tuple[float, float] = 3.0, 0.8  # mean and spread
+    beyond: float = 1.2  # least distance behind the skin's edge
     thread: float = 0.34  # from one of its threads to the next
     blue: Rgb = (0.07, 0.20, 0.42)
     green: Rgb = (0.06, 0.28, 0.26)
@@ -259,7 +259,7 @@ def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Float
 
 
 def paint(rim: Rim, appearance: Appearance, pixels: int, seen: Mask | None = None) -> Coat:
-    """Maps of the rim, `pixels` on a side; `seen`: (m, m) where it may be seen, beyond which it is unpainted."""
+    """Maps of the rim, `pixels` on a side; `seen`: (m, m) where it may be seen; else unpainted."""
     rng = np.random.default_rng([appearance.rim_seed, 1])
     extent = rim.extent_mm
 
@@ -530,9 +530,8 @@ def _with_skin(
     fat = step((place + thick + lobules) / 0.4) * step(-(place + thick) / 0.15)
     dermis = step((place + thick) / 0.15) * (1 - skin)
     colour, relief = below
-    yellow = through(
-        speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), np.clip(0.1 + 0.5 * blood + 0.3 * mottle, 0.05, 0.9), Skin.stain
-    )
+    soaked = np.clip(0.1 + 0.5 * blood + 0.3 * mottle, 0.05, 0.9)
+    yellow = through(speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), soaked, Skin.stain)
     colour = over(colour, yellow, fat[..., None])
     colour = over(colour, speckled(Skin.dermis, 0.06 * mottle, 0.04 * fine), 0.8 * dermis[..., None])
     pale = speckled(Skin.albedo, 0.05 * mottle, 0.04 * grain, 0.07 * fine)
