@@ -235,6 +235,8 @@ def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps:
     collar = step((along - finish.bare_mm) / 0.1) * step((finish.bare_mm + length - along) / 0.1)
     joint = ridge(along - finish.bare_mm, groove) + 0.8 * ridge(along - finish.bare_mm - length, groove)
     joint = joint * (finish.bare_mm > 0)
+    if texels.kind == "spatula":  # a flat blade
+        lost, glint = 0.0, 0 * glint
     shade = (1 - lost * np.abs(across) ** power) * (1 - 0.35 * collar) * (1 - 0.75 * np.minimum(joint, 1))
     whole = 0.6 + 0.4 * np.asarray(finish.coat, np.float32) / max(*finish.coat, 0.05)
     painted = painted * shade[..., None] + (glint * (1 - np.minimum(joint, 1)))[..., None] * whole
