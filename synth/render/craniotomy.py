@@ -87,7 +87,12 @@ def craniotomy(
     paint_rim = partial(rim.paint, around, appearance, texels, seen)
     painted = partial(_COATS.get, paint_rim, around, appearance, texels, seen)
     rim_coat = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
-    static = [Body(how.scale * around.shape.vertices, around.shape.faces, around.uv, rim_coat)]
+    # Only faces that may be seen: all bodies' trees are made anew every frame.
+    column, row = np.clip((around.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
+    shown = seen[row, column][around.shape.faces].any(axis=1)
+    shown[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
+    faces = around.shape.faces[shown]
+    static = [Body(how.scale * around.shape.vertices, faces, around.uv, rim_coat)]
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
     if how.surroundings is not None:

@@ -275,7 +275,8 @@ def paint(rim: Rim, appearance: Appearance, pixels: int, seen: Mask | None = Non
     hidden = np.hypot(x, y) < float(rim.edge.min()) + min(CutEdge.painted) - 1
     if seen is not None:
         hidden |= cv2.resize(seen.astype(np.float32), (pixels, pixels)) < 0.01
-    where = np.flatnonzero(~hidden)
+    hidden[0, 0] = False  # a texel at least
+    where = np.flatnonzero(~hidden).astype(np.int32)
     colour, bumps, thin = noise.in_part(
         partial(_paint_rows, rim, appearance, streaks), where, (0.2, 0.0, 0.5), *maps
     )
