@@ -78,6 +78,9 @@ def build_clips(
             turn += (_CLIP_MM[0] + _GAP_MM) / away
             skew, blood = float(rng.normal(0, 0.12)), float(rng.uniform(0.02, 0.3))
             middle = _rest(ground, away * _outwards(turn), 0.1 * _CLIP_MM[1])
+            # On the highest of what it would cut into.
+            below = ground[np.hypot(*(ground - middle)[:, :2].T) < _CLIP_MM[1]]
+            middle[2] = max(middle[2], float(np.percentile(below[:, 2], 95)) if len(below) else -np.inf)
             if not _in_view(camera, middle):
                 continue
             along = np.array([-np.sin(turn + skew), np.cos(turn + skew), 0.1 * np.sin(9 * turn)])
