@@ -69,7 +69,7 @@ def build_clips(
     """
     rng = np.random.default_rng([seed, 6])
     colour = _COLOURS[rng.integers(len(_COLOURS))]
-    bars = list[_Bar]()
+    bars = list[Bar]()
     count, first = int(rng.integers(*_GROUPS)), rng.uniform(0, 2 * np.pi)
     for group in range(count):
         turn = first + 2 * np.pi * group / count + rng.normal(0, 0.25)
@@ -90,7 +90,7 @@ def build_clips(
             skin = Finish(
                 (0.6, 0.6, 0.6), 0.3, coat=colour, coat_alpha=0.16, bare_mm=-1.0, blood=blood, blood_mm=6.0
             )
-            bars.append(_Bar(part, 16, middle + (s[:, None] - 0.5) * along, skin, "clip"))
+            bars.append(Bar(part, 16, middle + (s[:, None] - 0.5) * along, skin, "clip"))
     return _bodies(bars, theatre, rng, 1.5 * camera.mm_per_px)
 
 
@@ -99,7 +99,7 @@ def build_hooks(
 ) -> list[Body]:
     """Blunt hooks of wire that hold back the wound's wall, drawn outwards; as `build_clips`."""
     rng = np.random.default_rng([seed, 8])
-    bars = list[_Bar]()
+    bars = list[Bar]()
     turns = rng.uniform(0, 2 * np.pi) + np.arange(n := rng.integers(*_HOOKS)) * 2 * np.pi / n
     for turn in turns + rng.normal(0, 0.3, n):
         out = _outwards(float(turn) + float(rng.normal(0, 0.15)))
@@ -116,7 +116,7 @@ def build_hooks(
         far = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * np.array([*out[:2], 0.12])
         path = np.concatenate([arc, far])
         steel = replace(_WIRE, blood=float(rng.uniform(0, 0.4)))
-        bars.append(_Bar(_wire(path, _HOOK_MM), 8, path, steel, "hook"))
+        bars.append(Bar(wire(path, _HOOK_MM), 8, path, steel, "hook"))
     return _bodies(bars, theatre, rng, camera.mm_per_px)
 
 
@@ -126,7 +126,7 @@ def build_patties(
     """Patties of cotton on the rim, over the opening's edge by a millimetre, each with a string outwards."""
     rng = np.random.default_rng([seed, 9])
     string = _STRING[rng.integers(len(_STRING))]
-    bodies, bars = list[Body](), list[_Bar]()
+    bodies, bars = list[Body](), list[Bar]()
     for _ in range(rng.integers(*_PATTIES)):
         turn, half = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(*_PATTY_MM))
         skew, inside = float(rng.normal(0, 0.5)), float(rng.uniform(*_INSIDE_MM))
@@ -150,7 +150,7 @@ def build_patties(
         path = np.stack([_rest(ground, point, 0.35) for point in flat])
         path[:, 2] = gaussian_filter1d(path[:, 2], 1.0, mode="nearest") + 0.15
         thread = Finish((0.5, 0.5, 0.5), 0.5, coat=string, coat_alpha=0.5, bare_mm=-1.0)
-        bars.append(_Bar(_wire(path, _STRING_MM), 4, path, thread, "string"))
+        bars.append(Bar(wire(path, _STRING_MM), 4, path, thread, "string"))
     return bodies + _bodies(bars, theatre, rng, 2 * camera.mm_per_px)
 
 
@@ -163,7 +163,7 @@ ALONG_RIM: dict[str, Callable[[Rim, float, Theatre, Floats, int, Camera], list[B
 
 
 @dataclass(frozen=True)
-class _Bar:
+class Bar:
     """A bar of rings along a path."""
 
     part: Part  # straight
@@ -192,7 +192,7 @@ class _Bar:
         return np.ascontiguousarray(places.reshape(-1, 2))
 
 
-def _bodies(bars: list[_Bar], theatre: Theatre, rng: np.random.Generator, mm_per_px: float) -> list[Body]:
+def _bodies(bars: list[Bar], theatre: Theatre, rng: np.random.Generator, mm_per_px: float) -> list[Body]:
     """All bars as one body, or none."""
     if not bars:
         return []
@@ -229,7 +229,7 @@ def _in_view(camera: Camera, point: Floats) -> bool:
     return bool(((place > -_MARGIN) & (place < 1 + _MARGIN)).all())
 
 
-def _wire(path: Floats, radius: float) -> Part:
+def wire(path: Floats, radius: float) -> Part:
     """A round wire with closed ends, as long as a path (R, 3) mm."""
     s = np.append(0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
     r = np.full(len(s), radius)
