@@ -200,7 +200,7 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     if not (texels.sheet or kind == "spatula"):
         # The dark room beside the lamps and the light between them, as on any round shaft under a microscope.
         dark = sum(depth * ridge(texels.across - place, width) for place, width, depth in _BANDS)
-        base = base * (1 - dark * texels.flat)[..., None]
+        base = np.asarray(base * (1 - dark * texels.flat)[..., None], np.float32)
         place, width, most = _CREST
         broken = np.clip(0.8 + 0.2 * lines + 0.2 * mottle, 0, 1) * texels.flat
         polished = np.asarray(most * broken * ridge(texels.across - place, width), np.float32)
@@ -240,7 +240,8 @@ def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps:
     shade = (1 - lost * np.abs(across) ** power) * (1 - 0.35 * collar) * (1 - 0.75 * np.minimum(joint, 1))
     whole = 0.6 + 0.4 * np.asarray(finish.coat, np.float32) / max(*finish.coat, 0.05)
     painted = painted * shade[..., None] + (glint * (1 - np.minimum(joint, 1)))[..., None] * whole
-    return np.asarray(painted, np.float32), bumps + 0.04 * collar - 0.05 * joint
+    bumps = np.asarray(bumps + 0.04 * collar - 0.05 * joint, np.float32)
+    return np.asarray(painted, np.float32), bumps
 
 
 def _felted(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
