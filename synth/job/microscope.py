@@ -88,10 +88,10 @@ class RenderSection(Section):
     stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Baseline to a right camera [mm], for a stereo dataset: its pictures, and motion in three dimensions,
     true and recovered; 0: monocular."""
-    scenery: tuple[Scenery, ...] = ("retractor", "bone", "drape")
-    """Objects around the opening, each in a share of the sequences: a retractor's blade over its edge (one of
-    five), the bone's cut edge (one of three), drapes in the corners (two of five), and, where named, clips on
-    the cut skin (two of five). They hide tissue and don't count as tissue."""
+    scenery: tuple[Scenery, ...] = ("retractor", "bone", "drape", "clips", "hooks", "patties")
+    """Objects around the opening, each in a share of the sequences: a retractor's blade over its edge (30%),
+    the bone's cut edge (50%), drapes in the corners (40%), clips (55%) and hooks (30%) on the cut skin,
+    patties of cotton on the rim (35%). They hide tissue and don't count as tissue."""
 
     @model_validator(mode="after")
     def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:

@@ -54,7 +54,7 @@ Curve = Annotated[
 Direction = Annotated[Vector, AfterValidator(_long)]
 MembraneState = Literal["stripped", "unknown", "intact"]
 """Knowledge of the tissue's membrane (pia): removed, unknown, or present."""
-Scenery = Literal["retractor", "bone", "drape", "clips"]
+Scenery = Literal["retractor", "bone", "drape", "clips", "hooks", "patties"]
 Group = Literal["instruments", "texture", "surroundings", "light", "camera", "field"]
 """What domain randomisation draws at random."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synth.arrays import Map
+from synth.arrays import Map, Mask
 from synth.render import instrument, scenery
 from synth.render.anatomy import noise, rim, texture
 from synth.render.anatomy.rim import Rim
@@ -18,7 +18,7 @@ from synth.render.anatomy.surface import CortexSurface, resize
 from synth.render.appearance import light
 from synth.render.appearance.family import Appearance
 from synth.render.appearance.reflection import Theatre
-from synth.render.camera.camera import Camera
+from synth.render.camera.camera import Camera, to_camera, to_pixels
 from synth.render.content import SceneContent
 from synth.render.idle import IdleInstrument
 from synth.render.instrument import NO_MESHES, OwnMesh
@@ -27,8 +27,9 @@ from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.33
+_RIM_ROUGHNESS, _RIM_DRY = 0.065, 0.33
 _SEEN = 1.3  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
+_SQUARES, _RIM_MM = 64, 2.0  # across the rim's map, to tell which of it is seen; its height
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
 _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wider than the picture
 
@@ -82,10 +83,16 @@ def craniotomy(
         wet = how.pattern.roughness, appearance.dry_roughness
     cortex = Wet(coat, *wet, ambient, appearance.fluid_index)
     # Where only the truth at rest is needed, the rim stays unpainted, which saves a second.
-    paint_rim = partial(rim.paint, around, appearance, texels)
-    painted = partial(_COATS.get, paint_rim, around, appearance, texels)
+    seen = _seen(camera, around.extent_mm, how.scale)
+    paint_rim = partial(rim.paint, around, appearance, texels, seen)
+    painted = partial(_COATS.get, paint_rim, around, appearance, texels, seen)
     rim_coat = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
-    static = [Body(how.scale * around.shape.vertices, around.shape.faces, around.uv, rim_coat)]
+    # Only faces that may be seen: all bodies' trees are made anew every frame.
+    column, row = np.clip((around.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
+    shown = seen[row, column][around.shape.faces].any(axis=1)
+    shown[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
+    faces = around.shape.faces[shown]
+    static = [Body(how.scale * around.shape.vertices, faces, around.uv, rim_coat)]
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
     if how.surroundings is not None:
@@ -97,8 +104,9 @@ def craniotomy(
     if how.surroundings is None:
         if "retractor" in appearance.scenery:
             static.append(scenery.build_retractor(how.scale * around.edge, theatre, ground, seed, px))
-        if "clips" in appearance.scenery:
-            static += scenery.build_clips(around, how.scale, theatre, ground, seed, camera)
+        for name, objects in scenery.ALONG_RIM.items():
+            if name in appearance.scenery:
+                static += objects(around, how.scale, theatre, ground, seed, camera)
     hand = np.random.default_rng([seed, 2])
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
@@ -107,6 +115,19 @@ def craniotomy(
         instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),
         spot=appearance.light.even,
     )
+
+
+def _seen(camera: Camera, extent_mm: float, scale: float) -> Mask:
+    """Whether squares (n, n) of the rim's map may be in the picture of the camera, wherever it moves."""
+    axis = scale * noise.centres(_SQUARES, extent_mm)
+    x, y = np.meshgrid(axis, axis)
+    local = to_camera(camera, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, _RIM_MM)]))
+    with np.errstate(all="ignore"):
+        plain = (local[:, :2] / local[:, 2:]) * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        places = np.stack([plain, to_pixels(camera, local)])
+    size, margin = np.asarray(camera.size), (_SEEN - 1) * 0.5 * float(np.hypot(*camera.size))
+    inside = (np.abs(places - 0.5 * size) < 0.5 * size + margin).all(axis=-1).any(axis=0)
+    return np.asarray((inside | (local[:, 2] < 1)).reshape(x.shape))
 
 
 def _wound(surface: CortexSurface, around: Rim, coat: Coat, appearance: Appearance) -> Map:

@@ -63,7 +63,7 @@ def draw_finish(strength: float, rng: np.random.Generator, kind: str) -> Finish:
     alpha, scattered, brushed, coat_alpha, wear, blood, long = rng.uniform(*np.transpose(ranges)).tolist()
     bloody = blood * (rng.random() < 0.6)
     body_only = scattered * (body != 3), brushed * (body == 1)
-    wet = 0.0 if soft else float(rng.choice([0.0, 1.5, 3.0, 5.0]))
+    wet = 0.0 if soft else float(rng.choice([1.5, 3.0, 5.0, 8.0]))
     streak = _STREAKS[body]
     return Finish(
         metal, alpha, streak, *body_only, coat, coat_alpha, 1.0 if soft else _COAT_STREAK, bare,

@@ -30,7 +30,14 @@ _HOLLOW = 0.2  # depth of a blade's hollow, as a share of half its width
 _BLOOD_MM = 0.025  # height of a film of blood
 _LINES_PX = 0.8  # rows, half the width of lines along a part
 _STEEPEST = 1.0  # slope of bumps
-_CHALK, _DULLED = 0.022, 0.6  # light that a handled coat scatters, and rise of its roughness
+_CHALK, _DULLED = 0.03, 0.8  # light that a handled coat scatters, and rise of its roughness
+_ROUNDED = 0.55, 2.6  # light that a coat lacks at a shaft's sides, and the power of the place across
+_GLINTS = (0.1, 0.10, 0.42), (-0.62, 0.05, 0.10), (0.9, 0.05, 0.12)  # on a coat: place across, width, light
+_BANDS = (0.46, 0.18, 0.45), (-0.4, 0.2, 0.5), (0.98, 0.08, 0.3), (-0.98, 0.08, 0.3)  # dark ones on steel
+_CREST = 0.05, 0.08, 0.5  # its bright one: place across, width, share of it that scatters
+_COLLAR_MM = 0.9, 0.13  # length of the collar in which a coat begins, and width of the grooves beside it
+_WEAVE_MM = 0.45  # between the fibres of felt
+_XRAY = np.array((0.03, 0.10, 0.28), np.float32)  # albedo of a patty's thread
 _STREAKS = 1.3, 0.16  # of blood along a shaft: wavelength across it, mm, as a share of that along it
 _BROAD_MM = 1.2  # half the width of a shaft from which on they are wider
 _SMEARED = (
@@ -189,17 +196,61 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn)
     bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
     base = np.asarray(finish.mirror, np.float32) * bright[..., None]
+    polished = np.zeros_like(along)
+    if not (texels.sheet or kind == "spatula"):
+        # The dark room beside the lamps and the light between them, as on any round shaft under a microscope.
+        dark = sum(depth * ridge(texels.across - place, width) for place, width, depth in _BANDS)
+        base = np.asarray(base * (1 - dark * texels.flat)[..., None], np.float32)
+        place, width, most = _CREST
+        broken = np.clip(0.8 + 0.2 * lines + 0.2 * mottle, 0, 1) * texels.flat
+        polished = np.asarray(most * broken * ridge(texels.across - place, width), np.float32)
     base, bumps = _shaped(texels, coat, base, bumps)
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
     handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
     scratch = step(lines - 1.6) * step(1.2 * mottle + 0.3)
     pale = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
     painted = np.asarray(finish.coat, np.float32) * pale + _CHALK * (handled + scratch)[..., None]
+    if not kind.startswith(("finger", "string", *CLOTH)):
+        painted, bumps = _moulded(finish, texels, handled, painted, bumps)
+    if kind == "patty":
+        painted, bumps = _felted(texels, painted, bumps)
     base = over(base, painted, coat[..., None])
     glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
     rough = over(rough, glossy * (1 + _DULLED * handled[..., None]), coat[..., None])
-    bare = (1 - coat) * (1 - finish.scattered)
+    bare = (1 - coat) * (1 - finish.scattered) * (1 - polished)
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
+
+
+def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map) -> tuple[Map, Map]:
+    """Albedo and bumps of a coat on a round shaft, with the collar in which it begins.
+
+    The microscope's lamps are next to its lens, so that a shaft is darker towards its sides and glints along
+    its crest, wherever it points: a coat's own lobe is too wide along it to show a line.
+    """
+    lost, power = _ROUNDED
+    across, along = texels.across, texels.along
+    dull = np.clip(1 - 0.6 * handled + 0.15 * texels.lines + 0.2 * texels.mottle, 0, 1.3)
+    glint = sum(light * ridge(across - place, width) for place, width, light in _GLINTS) * dull
+    length, groove = _COLLAR_MM
+    collar = step((along - finish.bare_mm) / 0.1) * step((finish.bare_mm + length - along) / 0.1)
+    joint = ridge(along - finish.bare_mm, groove) + 0.8 * ridge(along - finish.bare_mm - length, groove)
+    joint = joint * (finish.bare_mm > 0)
+    if texels.kind == "spatula":  # a flat blade
+        lost, glint = 0.0, 0 * glint
+    shade = (1 - lost * np.abs(across) ** power) * (1 - 0.35 * collar) * (1 - 0.75 * np.minimum(joint, 1))
+    whole = 0.6 + 0.4 * np.asarray(finish.coat, np.float32) / max(*finish.coat, 0.05)
+    painted = painted * shade[..., None] + (glint * (1 - np.minimum(joint, 1)))[..., None] * whole
+    bumps = np.asarray(bumps + 0.04 * collar - 0.05 * joint, np.float32)
+    return np.asarray(painted, np.float32), bumps
+
+
+def _felted(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
+    """Albedo and bumps of pressed cotton: its fibres, and the thread that shows in X-rays."""
+    along, aside, _ = np.moveaxis(texels.place, -1, 0)
+    fibre = np.cos(2 * np.pi / _WEAVE_MM * (along + 0.3 * texels.mottle)) + 0.7 * texels.grain
+    thread = step((0.13 - np.abs(aside + 0.03 * texels.mottle)) / 0.08)[..., None]
+    felt = painted * (0.85 + 0.07 * fibre + 0.06 * texels.blotch)[..., None]
+    return over(felt, _XRAY, thread), bumps + 0.02 * fibre
 
 
 def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map]:

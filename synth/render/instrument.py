@@ -202,7 +202,7 @@ def build(
     sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
     made = [shape_of(kind, a, size, meshes) for (kind, a), size in zip(drawn, sizes, strict=True)]
     made += [
-        ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
+        ((lay_cloth(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
         for one in idle
     ]
     parts = tuple(shapes for shapes, _ in made)
@@ -216,17 +216,7 @@ def build(
     return InstrumentMesh(parts, faces, *stack_maps(textures), theatre)
 
 
-def sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
-    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
-    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
-    c, w = np.cos(angle), np.sin(angle)
-    x = np.sign(c) * np.abs(c) ** power
-    y = np.sign(w) * np.abs(w) ** power
-    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
-    return np.stack(columns, -1).reshape(-1, 3)
-
-
-def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
+def lay_cloth(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
     """A cloth that lies on points (N, 3) mm, gauze in folds."""
     half = one.radius_mm, one.radius_mm * (0.46 if one.kind == "patty" else 0.8)
     rows, columns = (int(2 * side / _SHEET_MM) for side in half)
@@ -241,6 +231,16 @@ def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part
     if one.kind == "gauze":
         z += 0.5 * np.maximum(finish_maps.noise(at, 9.0, rng), 0).reshape(z.shape)
     return Part(np.column_stack([u, v, z.ravel() - tip[2]]), 1, rows)
+
+
+def sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
+    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
+    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    c, w = np.cos(angle), np.sin(angle)
+    x = np.sign(c) * np.abs(c) ** power
+    y = np.sign(w) * np.abs(w) ** power
+    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
+    return np.stack(columns, -1).reshape(-1, 3)
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:

@@ -1,31 +1,44 @@
-"""Hard objects around an opening: a retractor's blade over its edge, and clips along the cut skin.
+"""Objects around an opening: a retractor's blade over its edge, clips and hooks along the cut skin, patties.
 
 Sizes are those of common retractors and scalp clips, at the scale of the opening; chosen by eye.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from synth.arrays import Floats, Map
-from synth.geometry.triangles import Shape, joined
+from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render import instrument
+from synth.render.anatomy.layers import Rgb
 from synth.render.anatomy.rim import Rim
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
 from synth.render.camera.camera import Camera, project
-from synth.render.finish import Finish
+from synth.render.finish import Finish, draw_finish
+from synth.render.finish_maps import RING
+from synth.render.idle import IdleInstrument
 from synth.render.instrument import Part
-from synth.render.materials import Body, FinishMaps, Metal, stack_maps
+from synth.render.materials import Body, FinishMaps, Metal, read_map, stack_maps
 
 _DULL = Finish(  # a retractor's, darkened against glare
     (0.38, 0.365, 0.35), 0.2, 2.0, scattered=0.05, wear=0.35, blood=0.3, blood_mm=5.0, wet_mm=3.0
 )
-_CLIP_MM = 4.4, 1.7  # length and radius
-_GROUPS, _TOGETHER = (3, 6), (1, 4)  # clips: numbers of groups, and in each
-_GAP_MM, _BEHIND_MM = 1.3, 0.9  # between two, and from the foot of the wound's wall
-_MARGIN = 0.15  # of the picture, outside which a clip is left out
-_COLOURS = (0.03, 0.06, 0.24), (0.03, 0.06, 0.24), (0.5, 0.55, 0.6)  # blue, or white
+_WIRE = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood_mm=4.0)
+_CLIP_MM = 3.4, 2.1  # length along the skin's edge and radius
+_GROUPS, _TOGETHER = (3, 6), (2, 4)  # clips: numbers of groups, and in each
+_GAP_MM, _BEHIND_MM = 1.2, 0.5  # between two, and from the skin's edge
+_MARGIN = 0.15  # of the picture, outside which an object is left out
+_COLOURS = (0.012, 0.035, 0.26), (0.012, 0.035, 0.26), (0.03, 0.10, 0.34), (0.6, 0.62, 0.64)  # blues, white
+_HOOKS, _HOOK_MM = (2, 5), 0.36  # their number, and the radius of their wire
+_PATTIES, _PATTY_MM = (1, 4), (2.2, 3.6)  # their number, and half their length
+_INSIDE_MM = 0.4, 1.3  # by which a patty reaches over the opening's edge
+_STRING: tuple[Rgb, ...] = (0.03, 0.05, 0.16), (0.02, 0.06, 0.04), (0.03, 0.03, 0.03)
+_STRING_MM = 0.13  # its radius
 
 
 def build_retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int, mm_per_px: float) -> Body:
@@ -56,42 +69,177 @@ def build_clips(
     """
     rng = np.random.default_rng([seed, 6])
     colour = _COLOURS[rng.integers(len(_COLOURS))]
-    shapes, textures, size = list[Shape](), list[tuple[Map, FinishMaps]](), np.asarray(camera.size)
+    bars = list[Bar]()
     count, first = int(rng.integers(*_GROUPS)), rng.uniform(0, 2 * np.pi)
     for group in range(count):
         turn = first + 2 * np.pi * group / count + rng.normal(0, 0.25)
         for _ in range(rng.integers(*_TOGETHER)):
-            place = int(turn / (2 * np.pi) * len(rim.edge)) % len(rim.edge)
-            away = scale * (rim.edge[place] + rim.wall[place] + _BEHIND_MM)
+            away = scale * (_behind(rim, rim.skin, turn) + _BEHIND_MM)
             turn += (_CLIP_MM[0] + _GAP_MM) / away
-            skew, blood = float(rng.normal(0, 0.15)), float(rng.uniform(0.02, 0.2))
-            out = np.array([np.cos(turn), np.sin(turn), 0.0])
-            near = np.linalg.norm(ground[:, :2] - away * out[:2], axis=1) < 1.5
-            if not near.any():
-                continue
-            middle = away * out + [0, 0, float(np.percentile(ground[near, 2], 80)) - 0.1 * _CLIP_MM[1]]
-            at = project(camera, middle[None])[0] / size
-            if ((at < -_MARGIN) | (at > 1 + _MARGIN)).any():
+            skew, blood = float(rng.normal(0, 0.12)), float(rng.uniform(0.02, 0.3))
+            middle = _rest(ground, away * _outwards(turn), 0.1 * _CLIP_MM[1])
+            # On the highest of what it would cut into.
+            below = ground[np.hypot(*(ground - middle)[:, :2].T) < _CLIP_MM[1]]
+            middle[2] = max(middle[2], float(np.percentile(below[:, 2], 95)) if len(below) else -np.inf)
+            if not _in_view(camera, middle):
                 continue
             along = np.array([-np.sin(turn + skew), np.cos(turn + skew), 0.1 * np.sin(9 * turn)])
-            along /= np.linalg.norm(along)
-            part, start = _clip(), middle - 0.5 * _CLIP_MM[0] * along
-            (vertices,) = instrument.place([part], np.stack([start, start]), np.stack([along, along]))
-            shapes.append(Shape(vertices, part.shape.faces))
-            skin = Finish((0.6, 0.6, 0.6), 0.3, coat=colour, bare_mm=-1.0, blood=blood, blood_mm=9.0)
-            textures.append((part.uv, part.maps(skin, "clip", rng, 2 * camera.mm_per_px)))
-    if not shapes:
+            along *= _CLIP_MM[0] / np.linalg.norm(along)
+            part = _clip()
+            s = part.profile[::RING, 2] / _CLIP_MM[0]
+            skin = Finish(
+                (0.6, 0.6, 0.6), 0.3, coat=colour, coat_alpha=0.16, bare_mm=-1.0, blood=blood, blood_mm=6.0
+            )
+            bars.append(Bar(part, 16, middle + (s[:, None] - 0.5) * along, skin, "clip"))
+    return _bodies(bars, theatre, rng, 1.5 * camera.mm_per_px)
+
+
+def build_hooks(
+    rim: Rim, scale: float, theatre: Theatre, ground: Floats, seed: int, camera: Camera
+) -> list[Body]:
+    """Blunt hooks of wire that hold back the wound's wall, drawn outwards; as `build_clips`."""
+    rng = np.random.default_rng([seed, 8])
+    bars = list[Bar]()
+    turns = rng.uniform(0, 2 * np.pi) + np.arange(n := rng.integers(*_HOOKS)) * 2 * np.pi / n
+    for turn in turns + rng.normal(0, 0.3, n):
+        out = _outwards(float(turn) + float(rng.normal(0, 0.15)))
+        held = scale * (_behind(rim, rim.skin, float(turn)) - 0.6)
+        foot = _rest(ground, held * _outwards(float(turn)), 0.0)
+        if not _in_view(camera, foot):
+            continue
+        # From inside the wound over its edge, then down to the skin and straight out of view.
+        crest = _rest(ground, foot + 1.6 * out, 0.9)
+        bend = np.linspace(-0.6, 0.5, 9)[:, None] * np.pi
+        start = foot + 0.6 * out
+        high = max(float(crest[2] - foot[2]), 0.8)
+        arc = start + 1.1 * np.sin(bend) * out + [0, 0, 1] * (high * np.cos(bend) - 0.1)
+        far = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * np.array([*out[:2], 0.12])
+        path = np.concatenate([arc, far])
+        steel = replace(_WIRE, blood=float(rng.uniform(0, 0.4)))
+        bars.append(Bar(wire(path, _HOOK_MM), 8, path, steel, "hook"))
+    return _bodies(bars, theatre, rng, camera.mm_per_px)
+
+
+def build_patties(
+    rim: Rim, scale: float, theatre: Theatre, ground: Floats, seed: int, camera: Camera
+) -> list[Body]:
+    """Patties of cotton on the rim, over the opening's edge by a millimetre, each with a string outwards."""
+    rng = np.random.default_rng([seed, 9])
+    string = _STRING[rng.integers(len(_STRING))]
+    bodies, bars = list[Body](), list[Bar]()
+    for _ in range(rng.integers(*_PATTIES)):
+        turn, half = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(*_PATTY_MM))
+        skew, inside = float(rng.normal(0, 0.5)), float(rng.uniform(*_INSIDE_MM))
+        lean = _outwards(turn + skew)
+        middle = (scale * _behind(rim, 0 * rim.skin, turn) - inside) * _outwards(turn) + half * lean
+        if not _in_view(camera, _rest(ground, middle, 0.0)):
+            continue
+        (x, y, _), tip = lean.tolist(), (float(middle[0]), float(middle[1]), 0.0)
+        cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
+        part = instrument.lay_cloth(cloth, ground, rng)
+        (vertices,) = instrument.place([part], *cloth.at(0.0))
+        soaked = float(rng.uniform(0.05, 0.38))
+        felt = replace(draw_finish(0.0, rng, "patty"), blood=soaked, blood_mm=0.6 * half)
+        maps = part.maps(felt, "patty", rng, camera.mm_per_px)
+        sheet = Shape(vertices, part.shape.faces)
+        bodies.append(_body(sheet, part.uv, maps, theatre, np.full(len(vertices), 0.9)))
+        start, curl = middle + 0.9 * half * lean, rng.normal(0, 0.5, 2)
+        s = np.linspace(0, 1, 18)[:, None]
+        side = np.array([-lean[1], lean[0], 0.0])
+        flat = start + 16 * s * lean + side * (16 * (curl[0] * s**2 + 0.3 * curl[1] * np.sin(2 * np.pi * s)))
+        path = np.stack([_rest(ground, point, 0.35) for point in flat])
+        path[:, 2] = gaussian_filter1d(path[:, 2], 1.0, mode="nearest") + 0.15
+        thread = Finish((0.5, 0.5, 0.5), 0.5, coat=string, coat_alpha=0.5, bare_mm=-1.0)
+        bars.append(Bar(wire(path, _STRING_MM), 4, path, thread, "string"))
+    return bodies + _bodies(bars, theatre, rng, 2 * camera.mm_per_px)
+
+
+ALONG_RIM: dict[str, Callable[[Rim, float, Theatre, Floats, int, Camera], list[Body]]] = {
+    "clips": build_clips,
+    "hooks": build_hooks,
+    "patties": build_patties,
+}
+"""What is set along the rim, by its name in `render.scenery`."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar of rings along a path."""
+
+    part: Part  # straight
+    sides: int  # of its cross-section, of a part's `RING`
+    path: Floats  # (R, 3) mm: middles of its rings
+    finish: Finish
+    kind: str
+
+    @property
+    def shape(self) -> Shape:
+        ahead = np.gradient(self.path, axis=0)
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        # Upwards where it is level, so that the shown half of its texture faces the microscope.
+        aside = np.cross(ahead, [0.0, 0.0, 1.0])
+        level = np.linalg.norm(aside, axis=1, keepdims=True)
+        mean = aside.sum(axis=0) / max(float(np.linalg.norm(aside.sum(axis=0))), 1e-9)
+        aside = np.where(level > 0.1, aside / np.maximum(level, 1e-9), mean)
+        up = np.cross(aside, ahead)
+        rings = self.part.profile.reshape(len(self.path), RING, 3)[:, :: RING // self.sides]
+        placed = self.path[:, None] + rings[..., :1] * up[:, None] + rings[..., 1:2] * aside[:, None]
+        return Shape(placed.reshape(-1, 3), grid_faces(len(rings), self.sides, "columns").reshape(-1, 3))
+
+    @property
+    def uv(self) -> Map:
+        places = self.part.uv.reshape(len(self.path), RING, 2)[:, :: RING // self.sides]
+        return np.ascontiguousarray(places.reshape(-1, 2))
+
+
+def _bodies(bars: list[Bar], theatre: Theatre, rng: np.random.Generator, mm_per_px: float) -> list[Body]:
+    """All bars as one body, or none."""
+    if not bars:
         return []
-    whole = joined(*shapes)
+    whole = joined(*(bar.shape for bar in bars))
+    textures = [(bar.uv, bar.part.maps(bar.finish, bar.kind, rng, mm_per_px)) for bar in bars]
     uv, maps = stack_maps(textures)
-    alpha, bare = np.full(len(whole.vertices), 0.3), np.zeros(len(whole.vertices))
-    glow = reflection.glow(whole, alpha, bare, theatre)
-    return [Body(*whole, uv, Metal(maps, glow))]
+    alpha = np.concatenate([np.full(len(bar.uv), bar.finish.alpha) for bar in bars])
+    return [_body(whole, uv, maps, theatre, alpha)]
+
+
+def _body(shape: Shape, uv: Map, maps: FinishMaps, theatre: Theatre, alpha: Floats) -> Body:
+    bare = read_map(maps.bare, uv).astype(np.float64)
+    return Body(*shape, uv, Metal(maps, reflection.glow(shape, alpha, bare, theatre)))
+
+
+def _outwards(turn: float) -> Floats:
+    return np.array([np.cos(turn), np.sin(turn), 0.0])
+
+
+def _behind(rim: Rim, beyond: Floats, turn: float) -> float:
+    """Distance [mm] from the middle, in the rim's size, of an outline (A,) `beyond` the opening's edge."""
+    place = int(turn % (2 * np.pi) / (2 * np.pi) * len(rim.edge)) % len(rim.edge)
+    return float(rim.edge[place] + beyond[place])
+
+
+def _rest(ground: Floats, point: Floats, above: float) -> Floats:
+    """The point (3,) mm set on the ground's points (N, 3), or `above` it."""
+    near = np.argsort(((ground[:, :2] - point[:2]) ** 2).sum(axis=1))[:12]
+    return np.array([point[0], point[1], float(ground[near, 2].max()) + above])
+
+
+def _in_view(camera: Camera, point: Floats) -> bool:
+    place = project(camera, point[None])[0] / np.asarray(camera.size)
+    return bool(((place > -_MARGIN) & (place < 1 + _MARGIN)).all())
+
+
+def wire(path: Floats, radius: float) -> Part:
+    """A round wire with closed ends, as long as a path (R, 3) mm."""
+    s = np.append(0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    r = np.full(len(s), radius)
+    r[[0, -1]] *= 0.05
+    return Part(instrument.sweep(s, r, r, np.zeros_like(s), 1.0), 0)
 
 
 def _clip() -> Part:
-    """A short tube with a rib at both ends."""
+    """A short round band with a rib at both ends and a broad one in its middle."""
     length, radius = _CLIP_MM
-    s = length * np.array([0.0, 0.0, 0.04, 0.2, 0.26, 0.74, 0.8, 0.96, 1.0, 1.0])
-    r = radius * np.array([0.02, 0.9, 1.0, 1.0, 0.86, 0.86, 1.0, 1.0, 0.9, 0.02])
-    return Part(instrument.sweep(s, r, r, np.zeros_like(s), 1.0), 0)
+    s = length * np.array([0.0, 0.0, 0.03, 0.16, 0.2, 0.32, 0.36, 0.64, 0.68, 0.8, 0.84, 0.97, 1.0, 1.0])
+    r = radius * np.array([0.02, 0.93, 1.0, 1.0, 0.93, 0.93, 0.97, 0.97, 0.93, 0.93, 1.0, 1.0, 0.93, 0.02])
+    return Part(instrument.sweep(s, r, r, np.zeros_like(s), 0.8), 0)

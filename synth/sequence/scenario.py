@@ -58,10 +58,12 @@ _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
 _SHOWN = {
-    "retractor": 0.2,
-    "bone": 0.33,
+    "retractor": 0.3,
+    "bone": 0.5,
     "drape": 0.4,
-    "clips": 0.4,
+    "clips": 0.55,
+    "hooks": 0.3,
+    "patties": 0.35,
 }  # shares of the sequences that show a part
 
 

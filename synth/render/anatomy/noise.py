@@ -11,9 +11,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from synth.arrays import Floats, Map
+from synth.arrays import Floats, Indices, Map
 
 _ROWS = 8  # of a map at a time: intermediate results stay in the processor's cache
+_CHUNK = 8192  # pixels, for the same reason
 
 
 def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm: float, width: float) -> Map:
@@ -46,6 +47,21 @@ def in_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...
     starts = range(0, len(maps[0]), _ROWS)
     parts = [paint(*(image[start : start + _ROWS] for image in maps)) for start in starts]
     return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+
+
+def in_part(
+    paint: Callable[..., tuple[Map, ...]], where: Indices, rest: tuple[float, ...], *maps: Map
+) -> tuple[Map, ...]:
+    """As `in_rows`, of the pixels (M,) `where` alone, counted row by row; others are filled with `rest`."""
+    flat = [image.reshape(-1, *image.shape[2:]) for image in maps]
+    painted = list[Map]()
+    for start in range(0, len(where), _CHUNK):
+        part = where[start : start + _CHUNK]
+        for k, values in enumerate(paint(*(image[part][None] for image in flat))):
+            if k == len(painted):
+                painted.append(np.full((len(flat[0]), *values.shape[2:]), rest[k], np.float32))
+            painted[k][part] = values[0]
+    return tuple(values.reshape(*maps[0].shape[:2], *values.shape[1:]) for values in painted)
 
 
 def sample(image: Map, xy: Floats, extent_mm: float) -> Map:

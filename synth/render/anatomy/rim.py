@@ -65,8 +65,8 @@ class Suture:
 class Dura:
     """The dura around the opening, pulled up at stitches, folded between them [mm]."""
 
-    width: tuple[float, float] = 1.5, 0.9  # mean and spread around the opening, see `_uneven`
-    pulled: tuple[float, float] = 2.6, 2.2  # added width at a stitch, and over what distance aside
+    width: tuple[float, float] = 1.2, 0.7  # mean and spread around the opening, see `_uneven`
+    pulled: tuple[float, float] = 2.1, 2.2  # added width at a stitch, and over what distance aside
     slope: float = 0.25  # rise outwards
     tent: tuple[float, float] = 0.7, 1.3  # height at a stitch, and over what distance
     folds: tuple[float, float, float] = (
@@ -107,35 +107,50 @@ class Blood:
 class Wound:
     """Gutter behind the dura, and the wall of galea and muscle beyond it [mm]."""
 
-    gutter: tuple[float, float] = 1.2, 0.7  # width: mean and spread
+    gutter: tuple[float, float] = 0.6, 0.35  # width: mean and spread
+    smooth: float = 0.4  # rad over which it follows the dura's end
     floor: float = 0.9  # height over the brain
     rise: float = 2.0  # of the wall
+    steep: tuple[float, float] = 2.5, 0.3  # width over which it rises, and its start as a share of that
     shadow: Rgb = (0.6, 0.9, 0.9)  # absorption that darkens the gutter
     blood: Rgb = (0.3, 1.7, 2.1)  # absorption
-    bundles: int = 3  # of muscle's fibres, as many as the dura's
+    bundles: tuple[float, float] = 17.0, 3.0  # texels of noise per mm across and along muscle's fibres
+    fascia: Rgb = (0.66, 0.47, 0.38)  # albedo of the whitish sheet that covers some of them
     fat: Rgb = (0.62, 0.38, 0.16)  # albedo
     fatty: float = 0.55  # share of it where there is some
 
 
 class Skin:
-    """Skin behind the wound's wall, stained with blood towards it."""
+    """Skin behind the wound's wall: its cut edge, rolled outwards, of fat below the pale dermis [mm]."""
 
-    away: tuple[float, float] = 4.5, 2.0  # behind the wall's foot: mean and spread
-    albedo: Rgb = (0.68, 0.44, 0.31)
+    away: tuple[float, float] = 3.4, 1.4  # behind the wall's foot: mean and spread,
+    clipped: tuple[float, float] = 1.6, 0.5  # where clips hold it,
+    boned: float = 2.6  # and by how much farther behind bone
+    albedo: Rgb = (0.70, 0.46, 0.33)
+    fat: Rgb = (0.82, 0.60, 0.36)  # in lobules
+    dermis: Rgb = (0.80, 0.56, 0.46)
+    width: tuple[float, float] = 0.9, 0.3  # of the fat, and of the dermis over it
+    stain: Rgb = (0.3, 1.2, 1.35)  # absorption of blood on the fat
+    roll: float = 0.8  # height of the edge
 
 
 class Bone:
-    """Albedos of compact bone and of its spongy section, absorption of blood stains."""
+    """The bone's cut edge from its foot up: inner table, diploe, outer table, then its outer surface [mm]."""
 
-    compact: Rgb = (0.82, 0.71, 0.54)
-    spongy: Rgb = (0.62, 0.30, 0.22)
-    stain: Rgb = (0.2, 1.2, 1.4)
+    tables: tuple[float, float, float] = 0.4, 1.85, 2.35  # ends of the three
+    rise: float = 2.6
+    bare: tuple[float, float] = 5.0, 1.5  # from its foot to where soft tissue covers it: mean and spread
+    compact: Rgb = (0.86, 0.76, 0.58)  # albedo
+    spongy: Rgb = (0.80, 0.57, 0.42)  # of the diploe's trabeculae
+    marrow: Rgb = (0.38, 0.06, 0.045)  # in its pores
+    stain: Rgb = (0.2, 1.2, 1.4)  # absorption of blood
 
 
 class Drape:
     """Surgical drapes: distance behind the wall's foot [mm], and albedos."""
 
     away: tuple[float, float] = 3.0, 0.8  # mean and spread
+    beyond: float = 1.2  # least distance behind the skin's edge
     thread: float = 0.34  # from one of its threads to the next
     blue: Rgb = (0.07, 0.20, 0.42)
     green: Rgb = (0.06, 0.28, 0.26)
@@ -156,6 +171,7 @@ class Rim:
     crease: Floats  # (A,) mm beyond the edge: end of the inner face of what is turned over
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
     bone: bool  # whether the wall is of bone, else of muscle
+    bare: Floats  # (A,) mm from the wall's foot to the end of bare bone
     skin: Floats  # (A,) mm beyond the edge: start of the skin
     cloth: Floats  # (A,) mm beyond the edge: start of the drapes; empty without drapes
 
@@ -187,17 +203,25 @@ def build(
     lumps = noise.sample(noise.band(rng, 256, extent, 3.5, 0.6), flat, extent).reshape(away.shape)
     asides = np.stack([_aside(angle, stitch) for stitch in stitches]) * float(edge.mean())
     dura = _uneven(rng, angle, *Dura.width) + Dura.pulled[0] * ridge(asides, Dura.pulled[1]).max(axis=0)
-    wall = dura + _uneven(rng, angle, *Wound.gutter)
-    skin = wall + _uneven(rng, angle, *Skin.away)
-    cloth = wall + _uneven(rng, angle, *Drape.away) if "drape" in appearance.scenery else np.zeros(0)
+    # Sawn bone and retracted muscle know nothing of the dura's corners, which may lie on them.
+    wide = around * Wound.smooth / (2 * np.pi)
+    wall = gaussian_filter1d(edge + dura, wide, mode="wrap") - edge + _wave(rng, angle, *Wound.gutter)
+    wall = np.maximum(wall, 0.8)
     bone = "bone" in appearance.scenery
+    clipped = "clips" in appearance.scenery or "hooks" in appearance.scenery
+    skin = wall + Skin.boned * bone + _wave(rng, angle, *(Skin.clipped if clipped else Skin.away))
+    cloth = wall + _wave(rng, angle, *Drape.away)
+    cloth = np.maximum(cloth, skin + Drape.beyond) if "drape" in appearance.scenery else np.zeros(0)
     high, reach = Dura.tent
     tents = high * ridge(asides[..., None], reach).max(axis=0) * ridge(away, at=0.8, width=reach)
     outer = np.clip(away, 0, None)
     raised = np.where(away > 0, tents + Dura.slope * outer + 0.15 * np.minimum(outer, 1) * lumps, 0)
     beyond = step((away - dura[:, None]) / 0.5 - 0.4)
-    wound = Wound.floor - CutEdge.top[1] + Wound.rise * step((away - wall[:, None]) / 2.5 - 0.3)
-    wound = wound + (0.1 if bone else 0.25) * lumps
+    past = away - wall[:, None]
+    over_mm, start = (Bone.tables[2], 0.5) if bone else Wound.steep
+    wound = (Bone.rise if bone else Wound.rise) * step(past / over_mm - start)
+    wound = wound + Wound.floor - CutEdge.top[1] + (0.08 if bone else 0.25) * lumps
+    wound = wound + Skin.roll * ridge(away - skin[:, None], 1.1, at=0.5)
     if len(cloth):
         wound = wound + step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
     z = _under(surface, flat).reshape(away.shape) + up + over(raised, wound, beyond)
@@ -209,9 +233,10 @@ def build(
     rng = np.random.default_rng([appearance.rim_seed, 7])
     crease, end = _flaps(rng, angle, dura)
     held = rng.random(len(stitches)) < Flap.held
+    bare = np.maximum(_wave(rng, angle, *Bone.bare), Bone.tables[2] + 1)
     held &= appearance.family != "calf"  # the dura of a specimen is not sewn back
     return Rim(
-        Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, skin, cloth
+        Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, bare, skin, cloth
     )
 
 
@@ -233,8 +258,8 @@ def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Float
     return crease, np.maximum(end + 0.5 * ragged, crease + 0.15)
 
 
-def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
-    """Maps of the rim, `pixels` on a side."""
+def paint(rim: Rim, appearance: Appearance, pixels: int, seen: Mask | None = None) -> Coat:
+    """Maps of the rim, `pixels` on a side; `seen`: (m, m) where it may be seen; else unpainted."""
     rng = np.random.default_rng([appearance.rim_seed, 1])
     extent = rim.extent_mm
 
@@ -247,9 +272,16 @@ def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
     maps = [x, y, drawn(9.0, 2.4), drawn(2.5, 2.2), drawn(0.6, 1.4)]
     streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
     maps += [drawn(6.0, 3.4), _drops(rng, appearance.blood, rim, pixels), _fine(rng, pixels, extent)]
-    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, streaks), *maps)
+    hidden = np.hypot(x, y) < float(rim.edge.min()) + min(CutEdge.painted) - 1
+    if seen is not None:
+        hidden |= cv2.resize(seen.astype(np.float32), (pixels, pixels)) < 0.01
+    hidden[0, 0] = False  # a texel at least
+    where = np.flatnonzero(~hidden).astype(np.int32)
+    colour, bumps, thin = noise.in_part(
+        partial(_paint_rows, rim, appearance, streaks), where, (0.2, 0.0, 0.5), *maps
+    )
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    return Coat(colour, normals(noise.blur(bumps, 0.08, extent), extent), dry)
+    return Coat(colour, normals(noise.blur(bumps, 0.11, extent), extent), dry)
 
 
 def _fine(rng: np.random.Generator, pixels: int, extent_mm: float) -> Map:
@@ -327,6 +359,14 @@ def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
     return np.maximum(wave, 0.35 * mean)
 
 
+def _wave(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
+    """A distance (A,) mm that varies smoothly around the opening."""
+    wave = np.full_like(angle, mean)
+    for order in range(1, 6):
+        wave += rng.normal(0, spread / order) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
+    return np.maximum(wave, 0.3 * mean)
+
+
 def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Albedo (r, n, 3), bumps mm and dry share (r, n) of some rows of the maps; see `paint` for `maps`."""
     x, y, wide, mottle, grain, spilt, drops, fine = maps
@@ -334,7 +374,6 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     reach, past = _round(rim.dura, angle), away - _round(rim.wall, angle)
     fibres = _fibres(streaks, angle, away, mean)
-    bundles = _fibres(streaks, Wound.bundles * angle + 0.15 * wide, away + 3 * mottle, mean)
     outer = step((away - reach) / 0.3 + 0.25 * mottle)
     gutter = outer * (1 - step(past / 1.5 + 0.3 * mottle))
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
@@ -368,34 +407,35 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     dura = through(dura, bloody * (1 - 0.7 * section), Wound.blood)
     dura = through(dura, turned * step(crease / 0.1) * np.exp(-np.abs(crease) / 0.35), Flap.shadow)
     colour = over(dura, np.asarray(CutEdge.albedo, np.float32), section[..., None])
-    beyond = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.26 * bundles, 0.07 * fine)
-    beyond = over(
-        beyond,
-        np.asarray(Wound.fat, np.float32),
-        Wound.fatty * step(wide - 0.9 + 0.5 * mottle + 0.2 * bundles)[..., None],
-    )
+    bundles = _bundles(streaks, float(rim.stitches[0]), x, y, wide, mottle)
+    beyond, relief = _muscle(appearance, bundles, wide, mottle, spilt, fine)
+    beyond = through(beyond, 0.25 * soaked, Wound.blood)
+    wiped = np.clip(0.3 * bundles + 0.8 * wide + 0.15 * mottle + 1.2 * appearance.blood - 1.2, 0, 1.2)
+    tight = np.zeros_like(away)  # share of bone and skin, which soak up no fluid
     if rim.bone:
-        beyond = _bone(beyond, past, mottle, grain + fine)
-    skin = step((away - _round(rim.skin, angle)) / 1.5 + 0.25 * mottle) * (not rim.bone)
-    stained = np.clip(appearance.blood * (1.3 - 0.25 * past) + 0.2 * mottle + 0.4 * wide, 0, 1.5)
-    pale = through(speckled(Skin.albedo, 0.04 * mottle, 0.03 * grain, 0.06 * fine), stained, Wound.blood)
-    beyond = over(through(beyond, 0.25 * soaked, Wound.blood), pale, skin[..., None])
+        beyond, relief, tight = _with_bone(
+            (beyond, relief), past, _round(rim.bare, angle), wiped, appearance.blood, mottle, grain, fine
+        )
+    beyond, relief, skin = _with_skin(
+        (beyond, relief), away - _round(rim.skin, angle), wiped, appearance.blood, mottle, grain, fine
+    )
     run = np.clip((away - reach) / Blood.runs + 0.3 * mottle, 0, 3)
-    beyond = through(beyond, depth * pool * np.exp(-run) * (1 - skin), Wound.blood)
+    tight = np.maximum(tight, skin)
+    beyond = through(beyond, depth * pool * np.exp(-run) * (1 - tight), Wound.blood)
     colour = over(colour, beyond, outer[..., None])
     colour = through(colour, np.clip(-away - 1.2, 0, 1), CutEdge.shadow)
     colour = through(
         colour, gutter + 0.5 * ridge(away - reach, width=0.4) - 1.5 * np.minimum(folds, 0), Wound.shadow
     )
-    wet = np.maximum(pool, drops) * (1 - skin)
-    rough = 0.008 * grain + 0.0015 * fine + outer * (0.0015 * fine + 0.02 * bundles)
+    wet = np.maximum(pool, drops) * (1 - tight)
+    rough = 0.008 * grain + 0.0015 * fine + outer * (0.0015 * fine + relief)
     bumps = (folds + over(0.016 * mottle + 0.014 * fibres, 0.025 * mottle, outer) + rough) * (1 - 0.75 * wet)
     bumps = bumps + 0.06 * wet
     bumps = bumps + Flap.height * turned * (
         step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
     )
     dry = np.clip(
-        0.5 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner,
+        0.5 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * tight - 0.9 * wet - 0.3 * inner,
         0.02,
         1,
     )
@@ -432,13 +472,76 @@ def _soaked(level: float, uneven: Map) -> Map:
     )
 
 
-def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
-    """Albedo with bone over the wall's first millimetres: spongy in section, compact on top, stained."""
-    compact = speckled(Bone.compact, 0.06 * mottle, 0.03 * grain)
-    compact = through(compact, np.clip(0.7 * mottle - 0.5, 0, 2), Bone.stain)
-    cut = 0.6 * ridge(past, at=0.35, width=0.25)[..., None]
-    bone = over(compact, speckled(Bone.spongy, 0.25 * grain), cut)
-    return np.asarray(over(beyond, bone, step((3.9 + 0.5 * mottle - past) / 0.6)[..., None]), np.float32)
+def _bundles(streaks: Map, turn: float, x: Map, y: Map, wide: Map, mottle: Map) -> Map:
+    """Bundles of fibres along one direction, at an angle `turn` rad: noise (512, 512) drawn out."""
+    across, along = Wound.bundles
+    u = (across * (np.cos(turn) * x + np.sin(turn) * y) + 6 * wide).astype(np.float32) % 512
+    v = (along * (np.cos(turn) * y - np.sin(turn) * x) + mottle).astype(np.float32) % 512
+    noisy = cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(np.clip(noisy, -1.5, 2.0), np.float32)
+
+
+def _muscle(
+    appearance: Appearance, bundles: Map, wide: Map, mottle: Map, spilt: Map, fine: Map
+) -> tuple[Map, Map]:
+    """Albedo (r, n, 3) and bumps (r, n) mm of muscle, partly under its fascia, with fat in places."""
+    colour = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.3 * bundles, 0.08 * fine)
+    sheet = speckled(Wound.fascia, 0.14 * bundles, 0.05 * mottle, 0.06 * fine)
+    white = 0.85 * step((0.4 * bundles - 0.9 * spilt - 0.5) / 1.1)
+    colour = over(colour, sheet, white[..., None])
+    fat = Wound.fatty * step(wide - 0.9 + 0.5 * mottle + 0.2 * bundles)
+    colour = over(colour, np.asarray(Wound.fat, np.float32), fat[..., None])
+    return colour, (0.022 - 0.012 * white) * bundles
+
+
+def _with_bone(
+    below: tuple[Map, Map], past: Map, bare: Map, wiped: Map, blood: float, mottle: Map, grain: Map, fine: Map
+) -> tuple[Map, Map, Map]:
+    """Albedo and bumps with bone over the wall, from its cut edge to where soft tissue covers it, and its
+    share; `below`: albedo and bumps of that, `past`: mm from the wall's foot."""
+    inner, pores, edge = Bone.tables
+    place = past + 0.05 * mottle + 0.02 * grain
+    spongy = step((place - inner) / 0.12) * step((pores - place) / 0.12)
+    hole = step((grain + 0.3 * mottle + 0.2 * fine - 1.0) / 0.5) * spongy
+    surface = step((place - edge) / 0.15)
+    compact = speckled(Bone.compact, 0.05 * mottle, 0.025 * grain, 0.03 * fine)
+    bone = over(compact, speckled(Bone.spongy, 0.2 * grain, 0.1 * fine), spongy[..., None])
+    bone = over(bone, np.asarray(Bone.marrow, np.float32), hole[..., None])
+    oozed = np.clip(0.45 * mottle + 0.15 * grain + 1.2 * blood - 0.5, 0.05, 0.8) * (1 - surface)
+    smeared = (wiped + np.clip(1.2 * blood + 0.3 * mottle - 0.5 * (past - edge), 0, 0.6)) * surface
+    foramen = step((grain - 2.3) / 0.3) * surface
+    bone = through(bone, oozed + smeared + 1.5 * foramen, Bone.stain)
+    bone = through(bone, 0.7 * ridge(place, 0.35), Wound.shadow)
+    share = step((past + 0.1) / 0.12) * step((bare - past) / 0.3 + 0.4 * mottle)
+    bumps = 0.004 * mottle + 0.05 * ridge(place - edge, 0.2) - 0.06 * hole - 0.03 * foramen
+    colour, relief = below
+    return over(colour, bone, share[..., None]), over(relief, bumps, share), share
+
+
+def _with_skin(
+    below: tuple[Map, Map], past: Map, wiped: Map, blood: float, mottle: Map, grain: Map, fine: Map
+) -> tuple[Map, Map, Map]:
+    """Albedo and bumps with skin from `past` = 0 mm on, fat and dermis in its cut edge, and the skin's share;
+    `below`: albedo and bumps of what it is on."""
+    lobules, thick = Skin.width
+    place = past + 0.12 * mottle
+    skin = step(place / 0.2)
+    thick = thick * np.clip(1 + 0.9 * wiped - 0.6 * mottle, 0.2, 2)
+    lobules = lobules * np.clip(1 + 0.9 * wiped - 0.5 * mottle, 0.1, 2)
+    fat = step((place + thick + lobules) / 0.4) * step(-(place + thick) / 0.15)
+    dermis = step((place + thick) / 0.15) * (1 - skin)
+    colour, relief = below
+    soaked = np.clip(0.1 + 0.5 * blood + 0.3 * mottle, 0.05, 0.9)
+    yellow = through(speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), soaked, Skin.stain)
+    colour = over(colour, yellow, fat[..., None])
+    colour = over(colour, speckled(Skin.dermis, 0.06 * mottle, 0.04 * fine), 0.8 * dermis[..., None])
+    pale = speckled(Skin.albedo, 0.05 * mottle, 0.04 * grain, 0.07 * fine)
+    stained = wiped + np.clip(blood * (1.4 - 0.7 * place) + 0.35 * mottle, 0, 1.2)
+    pore = step((grain - 1.9) / 0.4)
+    pale = through(pale, stained + 0.35 * pore, Wound.blood)
+    bumps = 0.012 * grain - 0.015 * pore
+    colour = over(colour, pale, skin[..., None])
+    return colour, over(relief * (1 - fat) + 0.03 * grain * fat, bumps, np.maximum(skin, dermis)), skin
 
 
 def _draped(

@@ -109,11 +109,11 @@ class Film:
     climb_mm: float = 0.16  # distance over which that falls off
     reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
-    rough: float = 0.17  # standard deviation of slopes where the film is thin
+    rough: float = 0.08  # standard deviation of slopes where the film is thin
     level: float = 0.15  # share of the pia's slope that a pool takes away,
     filled: float = 0.6  # and of the relief under it
-    ripples: float = 0.055  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
-    ripples_mm: float = 0.22  # blur that makes them
+    ripples: float = 0.042  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
+    ripples_mm: float = 0.3  # blur that makes them
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 

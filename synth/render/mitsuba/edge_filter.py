@@ -64,10 +64,14 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
     if cover.any():
         reach = int((light.radius / np.maximum(cover, _LEAST)).max()) + _REACH
         share = cv2.blur(cover, (2 * reach + 1,) * 2)
-        x, y, wide, high = cv2.boundingRect((share > _LEAST).astype(np.uint8))
-        at = np.s_[y : y + high, x : x + wide]
-        radius = cv2.blur(light.radius, (2 * reach + 1,) * 2)[at] / np.maximum(share[at], _LEAST)
-        picture[at] = _covered(near[at], behind[at], cover[at], radius)
+        radius = cv2.blur(light.radius, (2 * reach + 1,) * 2) / np.maximum(share, _LEAST)
+        # Object by object: scenery at opposite borders would have a box as large as the picture.
+        count, label, boxes, _ = cv2.connectedComponentsWithStats((share > _LEAST).astype(np.uint8))
+        for k in range(1, count):
+            x, y, wide, high = boxes[k, :4].tolist()
+            box = np.s_[y : y + high, x : x + wide]
+            filtered = _covered(near[box], behind[box], cover[box], radius[box])
+            picture[box] = np.where((label[box] == k)[..., None], filtered, picture[box])
     return picture
 
 

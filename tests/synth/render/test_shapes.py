@@ -8,10 +8,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from synth.arrays import Map
 from synth.geometry.triangles import Shape
 from synth.job.schema import AnatomySection
-from synth.render import finish, idle, instrument
-from synth.render.anatomy import surface
+from synth.render import finish, idle, instrument, scenery
+from synth.render.anatomy import noise, surface
 from synth.render.anatomy.chart import Chart, places, unroll
 from synth.render.anatomy.colonisation import Growth, fill
 from synth.render.anatomy.tree import Tree, lattice, least_cost, relaxed, remaining
@@ -295,3 +296,32 @@ def test_an_idle_instrument_has_its_size(kind: str) -> None:
         points = made.pose(*one.at(0.0)).vertices
         wide = np.ptp(points[points[:, 2] < 40, :2], axis=0)
         assert (max if kind in idle.CLOTH else min)(wide) == pytest.approx(2 * radius, rel=0.06, abs=0.11)
+
+
+def test_a_map_painted_in_part_is_that_painted_whole() -> None:
+    rng = np.random.default_rng(0)
+    maps = [rng.random((40, 40)).astype(np.float32) for _ in "ab"]
+    where = rng.choice(1600, 300, replace=False).astype(np.int32)
+
+    def paint(a: Map, b: Map) -> tuple[Map, Map]:
+        return np.stack([a, b], axis=-1), a * b
+
+    whole, part = noise.in_rows(paint, *maps), noise.in_part(paint, where, (0.5, -1.0), *maps)
+    left = np.setdiff1d(np.arange(1600), where)
+    for full, some, rest in zip(whole, part, (0.5, -1.0), strict=True):
+        assert full.shape == some.shape
+        flat = some.reshape(1600, -1)
+        assert np.array_equal(flat[where], full.reshape(1600, -1)[where])
+        assert (flat[left] == rest).all()
+
+
+@pytest.mark.parametrize("sides", [4, 16])
+def test_a_bent_bar_faces_outwards_along_its_path(sides: int) -> None:
+    s = np.linspace(0, 1, 9)
+    path = np.column_stack([6 * s, 3 * s**2, np.sin(3 * s)])
+    wire = scenery.wire(path, 0.3)
+    shape = scenery.Bar(wire, sides, path, finish.Finish((0.6, 0.6, 0.6), 0.2), "hook").shape
+    made = trimesh.Trimesh(*shape, process=False)
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    section = 0.3**2 * sides / 2 * np.sin(2 * np.pi / sides)
+    assert 0.75 * section * length < made.volume < 1.05 * section * length
