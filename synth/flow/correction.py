@@ -46,17 +46,23 @@ _FARTHEST_PX = 2.0  # limit of a linearised step
 _TOLD_PX = np.float32(8)
 _LEAST_RESIDUAL = 1e-3  # mean square, in squared local deviations
 _OFFSET = np.float32(8)  # grey levels added before ratios are taken: the black of a sensor is not zero
+# What has appeared since the rest frame is what is masked now, but neither then nor beside it, and holds a
+# circle of a radius; up to the next length from it the correction is whole, from the last on there is none.
+# In shares of the picture's longer side.
+_APPEARED, _NEAR, _FAR = 0.015, 0.25, 0.5
 _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
 
 
-def correct(features: Map, flow: Map) -> tuple[Map, Map]:
+def correct(features: Map, flow: Map, near: Map) -> tuple[Map, Map]:
     """The corrected flow (H, W, 2) px, and the standard deviation (H, W) px of a component.
 
     What the network adds is shrunk where it isn't sure (Wiener's share, squared: unsquared, bare wet cortex
-    errs 5% more than without), and where the pictures determine the flow better than the network does. What
-    is masked is filled from around: in highlights on tissue the network invents motion.
+    errs 5% more than without), where the pictures determine the flow better than the network does, where they
+    ask for the opposite, and far from what has appeared. What is masked is filled from around: in highlights
+    on tissue the network invents motion.
 
-    `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px.
+    `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px; `near`: (h, w), see
+    `nearness`.
     """
     height, width, _ = flow.shape
     found = predict(WEIGHTS, features)[:, : features.shape[1], : features.shape[2]]
@@ -65,12 +71,43 @@ def correct(features: Map, flow: Map) -> tuple[Map, Map]:
     variance = np.exp(0.5 * spread.clip(-8, 5).sum(axis=0))
     signal = (missing * missing).mean(axis=0)
     share = (signal / (signal + variance)) ** 2 / (1 + variance * _information(features))
+    share *= near * _consent(features, missing)
     visible = np.ascontiguousarray(features[FEATURES.index("visible in both")])
     added = np.stack([image.fill(plane, visible) for plane in share * missing])
     deviation = np.sqrt(variance + ((missing - added) ** 2).mean(axis=0))
     planes = np.dstack([*added, deviation])
     wide = cv2.resize(planes, (CELL * planes.shape[1], CELL * planes.shape[0]))[:height, :width]
     return flow + wide[..., :2], wide[..., 2]
+
+
+def nearness(rest_usable: Mask, now_usable: Mask) -> Map:
+    """1 near what has appeared since the rest frame, 0 far from it, as (h, w) on cells; masks are (H, W).
+
+    The errors that the network knows are due to an instrument: what it hides, its shadow, and the dimple
+    under it. On wet tissue, on photographs and phantoms without one, all of the harm was done: highlights
+    that move, and stars, were taken for it.
+    """
+    longer = max(now_usable.shape)
+    radius = round(_APPEARED * longer)
+    side = 2 * radius + 1
+    beside = cv2.erode(rest_usable.astype(np.uint8), np.ones((side, side), np.uint8))
+    appeared = beside & ~now_usable
+    (core,) = means(cv2.distanceTransform(appeared, cv2.DIST_L2, 3) > radius)
+    if not core.any():
+        return np.zeros_like(core)
+    away = CELL * cv2.distanceTransform((core == 0).astype(np.uint8), cv2.DIST_L2, 3) - radius
+    return np.clip((_FAR - away / np.float32(longer)) / np.float32(_FAR - _NEAR), 0, 1)
+
+
+def _consent(features: Map, missing: Map) -> Map:
+    """Share (h, w) of what the network adds, by its angle to where the pictures point.
+
+    1 + cosine, at most 1, of the mean of Lucas and Kanade's steps. Most of what the correction still spoiled
+    on photographs, it had moved away from the pictures.
+    """
+    step = sum(features[x : x + 2] for x, _ in VECTORS[:-1])
+    cosine = (step * missing).sum(0) / np.maximum(np.hypot(*step) * np.hypot(*missing), 1e-9)
+    return np.minimum(1 + cosine, 1)
 
 
 def _information(features: Map) -> Map:

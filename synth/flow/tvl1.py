@@ -95,7 +95,8 @@ class Tvl1:
         if not self.corrected:
             return flow, sure
         described = correction.describe(rest, now, rest_usable, (before, after), visible, flow, sure)
-        flow, deviation = correction.correct(described, flow)
+        near = correction.nearness(rest_usable, now_usable)
+        flow, deviation = correction.correct(described, flow, near)
         # The network was not trained where pictures disagree, as under an unmasked instrument.
         return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 

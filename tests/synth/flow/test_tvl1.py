@@ -219,22 +219,65 @@ def test_a_sure_correction_is_ignored_where_pictures_agree_and_smooth_where_noth
     missing = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
     monkeypatch.setattr(correction, "predict", lambda weights, features: missing)
     features, still = _described(mirrored=False, x=0, y=0), np.zeros((104, 88, 2), np.float32)
-    variance = np.exp(-5)
-    flow, deviation = correction.correct(features, still)
+    variance, near = np.exp(-5), np.ones((26, 22), np.float32)
+    flow, deviation = correction.correct(features, still, near)
     assert np.abs(flow).max() < 0.02
     np.testing.assert_allclose(deviation, np.sqrt(0.5**2 + variance), rtol=0.02)  # either may be wrong
     known = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
     blank = features.copy()
     blank[known] = 0  # no contrast: the pictures say nothing
     missing[:, 10:14, 9:13] = [[[9.0]], [[-9.0]], [[-5]], [[-5]]]
-    shown, _ = correction.correct(blank, still)
+    for x, _ in correction.VECTORS[:-1]:
+        blank[x : x + 2] = missing[:2, :26, :22]  # but don't object
+    shown, _ = correction.correct(blank, still, near)
     share = 0.25 / (0.25 + variance)
     np.testing.assert_allclose(shown[:24, :24], 0.5 * share**2, rtol=1e-3)
     assert np.abs(shown[48:50, 44:46]).min() > 5
     blank[correction.FEATURES.index("visible in both"), 8:16, 7:15] = 0
-    hidden, hidden_deviation = correction.correct(blank, still)
+    hidden, hidden_deviation = correction.correct(blank, still, near)
     np.testing.assert_allclose(hidden[20:80, 20:70], 0.5 * share**2, rtol=1e-3)
     assert hidden_deviation[48, 44] > 5  # what the network says there is withheld
+
+
+def test_a_correction_is_confined_to_what_has_appeared_and_not_opposed_to_the_pictures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    missing = np.repeat(np.float32([0.5, -0.3, -5, -5]), 32 * 24).reshape(4, 32, 24)
+    monkeypatch.setattr(correction, "predict", lambda weights, features: missing)
+    features, still = _described(mirrored=False), np.zeros((104, 88, 2), np.float32)  # moved (0.4, -0.25)
+    known = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
+    features[known] = 0  # the pictures don't hold it back, but point there
+    near = np.zeros((26, 22), np.float32)
+    near[:, :11] = 1
+    flow, deviation = correction.correct(features, still, near)
+    assert flow[20:-20, 12:36, 0].min() > 0.4
+    assert np.abs(flow[:, 50:]).max() == 0
+    assert deviation[52, 70] > 0.4  # what is withheld is not known
+    missing[:2] *= -1
+    flow, _ = correction.correct(features, still, near)
+    assert np.abs(flow[20:-20, 12:36]).max() < 0.1
+
+
+def test_what_has_appeared_is_an_object_that_was_not_masked_at_rest() -> None:
+    shape, y, x = (240, 320), *np.mgrid[:240, :320]
+    every, rod = np.ones(shape, bool), (np.abs(x - 40) < 8) & (y < 100)
+    near = correction.nearness(every, ~rod)
+    assert near.shape == (60, 80)
+    assert near[:30, 9:11].min() == 1
+    assert near[:, 55:].max() == 0
+    assert near[10, 38] == pytest.approx(0.69, abs=0.06)  # 107 px away, 0.33 widths of 0.25 to 0.5
+    assert not correction.nearness(~rod, ~rod).any()
+    assert not correction.nearness(~rod, ~np.roll(rod, 4, 1)).any()  # a highlight's rim that moves
+    assert not correction.nearness(every, np.hypot(x - 100, y - 100) > 4).any()  # a small highlight
+    assert not correction.nearness(every, every).any()
+    assert correction.nearness(every[:1, :1], every[:1, :1]).shape == (1, 1)
+
+
+def test_without_an_instrument_the_flow_is_the_solvers() -> None:
+    pair = next(pairs(CLEAN, 1, 24))
+    every = np.ones(pair.rest.shape[:2], bool)
+    flows = [Tvl1(corrected=on).flow(pair.rest, pair.now, every, every)[0] for on in (False, True)]
+    np.testing.assert_array_equal(*flows)
 
 
 def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None:
