@@ -96,7 +96,8 @@ def nearness(rest_usable: Mask, now_usable: Mask) -> Map:
     if not core.any():
         return np.zeros_like(core)
     away = CELL * cv2.distanceTransform((core == 0).astype(np.uint8), cv2.DIST_L2, 3) - radius
-    return np.clip((_FAR - away / np.float32(longer)) / np.float32(_FAR - _NEAR), 0, 1)
+    share = (_FAR - away / np.float32(longer)) / np.float32(_FAR - _NEAR)
+    return np.asarray(np.clip(share, 0, 1), np.float32)
 
 
 def _consent(features: Map, missing: Map) -> Map:
@@ -105,9 +106,9 @@ def _consent(features: Map, missing: Map) -> Map:
     1 + cosine, at most 1, of the mean of Lucas and Kanade's steps. Most of what the correction still spoiled
     on photographs, it had moved away from the pictures.
     """
-    step = sum(features[x : x + 2] for x, _ in VECTORS[:-1])
+    step = np.sum([features[x : x + 2] for x, _ in VECTORS[:-1]], axis=0)
     cosine = (step * missing).sum(0) / np.maximum(np.hypot(*step) * np.hypot(*missing), 1e-9)
-    return np.minimum(1 + cosine, 1)
+    return np.asarray(np.minimum(1 + cosine, 1), np.float32)
 
 
 def _information(features: Map) -> Map:

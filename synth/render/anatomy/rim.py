@@ -523,11 +523,11 @@ def _with_skin(
 ) -> tuple[Map, Map, Map]:
     """Albedo and bumps with skin from `past` = 0 mm on, fat and dermis in its cut edge, and the skin's share;
     `below`: albedo and bumps of what it is on."""
-    lobules, thick = Skin.width
+    wide, deep = Skin.width
     place = past + 0.12 * mottle
     skin = step(place / 0.2)
-    thick = thick * np.clip(1 + 0.9 * wiped - 0.6 * mottle, 0.2, 2)
-    lobules = lobules * np.clip(1 + 0.9 * wiped - 0.5 * mottle, 0.1, 2)
+    thick = deep * np.clip(1 + 0.9 * wiped - 0.6 * mottle, 0.2, 2)
+    lobules = wide * np.clip(1 + 0.9 * wiped - 0.5 * mottle, 0.1, 2)
     fat = step((place + thick + lobules) / 0.4) * step(-(place + thick) / 0.15)
     dermis = step((place + thick) / 0.15) * (1 - skin)
     colour, relief = below
