@@ -84,8 +84,8 @@ def nearness(rest_usable: Mask, now_usable: Mask) -> Map:
     """1 near what has appeared since the rest frame, 0 far from it, as (h, w) on cells; masks are (H, W).
 
     The errors that the network knows are due to an instrument: what it hides, its shadow, and the dimple
-    under it. On wet tissue, on photographs and phantoms without one, all of the harm was done: highlights
-    that move, and stars, were taken for it.
+    under it. Most of its harm was done without one: highlights that move on wet tissue, and stars of a
+    photograph, were taken for it.
     """
     longer = max(now_usable.shape)
     radius = round(_APPEARED * longer)
@@ -96,7 +96,8 @@ def nearness(rest_usable: Mask, now_usable: Mask) -> Map:
     if not core.any():
         return np.zeros_like(core)
     away = CELL * cv2.distanceTransform((core == 0).astype(np.uint8), cv2.DIST_L2, 3) - radius
-    return np.clip((_FAR - away / np.float32(longer)) / np.float32(_FAR - _NEAR), 0, 1)
+    near = np.clip((_FAR - away / np.float32(longer)) / np.float32(_FAR - _NEAR), 0, 1)
+    return np.asarray(near, np.float32)
 
 
 def _consent(features: Map, missing: Map) -> Map:
@@ -105,9 +106,9 @@ def _consent(features: Map, missing: Map) -> Map:
     1 + cosine, at most 1, of the mean of Lucas and Kanade's steps. Most of what the correction still spoiled
     on photographs, it had moved away from the pictures.
     """
-    step = sum(features[x : x + 2] for x, _ in VECTORS[:-1])
+    step = np.sum([features[x : x + 2] for x, _ in VECTORS[:-1]], axis=0)
     cosine = (step * missing).sum(0) / np.maximum(np.hypot(*step) * np.hypot(*missing), 1e-9)
-    return np.minimum(1 + cosine, 1)
+    return np.asarray(np.minimum(1 + cosine, 1), np.float32)
 
 
 def _information(features: Map) -> Map:
