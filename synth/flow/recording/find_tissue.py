@@ -28,12 +28,14 @@ class Limits:
     rim: float = 0.2  # least share of the picture, still though it should move: openings 0.38, others 0.05
     alike: float = 0.4  # largest overlap of the colours of what is still and what moves: openings 0.31
     bins: int = 16  # of each channel of the colours, for their overlap
+    fine: int = 180  # rows below which colours are smoothed less
     near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
     wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
     sure: float = 0.7  # confidence above which a pixel is tracked
     visible: float = 0.7  # share of frames in which a pixel has to be tracked
     seen: float = 0.3  # likewise to tell that a part which has the tissue's colours moves as well
     rounds: int = 5  # of GrabCut
+    part: float = 0.2  # share of what moves in the main part, from which another part is tissue too
     small: float = 0.05  # share of the picture below which what is found is not the tissue
     solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
     still: float = (
@@ -151,7 +153,7 @@ class TissueSearch:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
         near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
         tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
-        tissue = _largest(_with_hidden(tissue, seeds, hidden), core)
+        tissue = _moving(_with_hidden(tissue, seeds, hidden), core, seeds)
         tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
         hull = _hull(tissue)
         return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
@@ -185,7 +187,8 @@ def _expected(motion: Map, moves: Mask) -> Map:
 
 def _colours(rgb: Pixels) -> Pixels:
     """Lab (h, w, 3), smoothed, with less of lightness, which shading changes, and more of colour."""
-    lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), 5).astype(np.float32)
+    side = 5 if len(rgb) >= Limits.fine else 3  # px: in small pictures 5 would remove veins and the rim
+    lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), side).astype(np.float32)
     return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
 
 
@@ -242,10 +245,13 @@ def _hull(mask: Mask) -> Mask:
     return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0)
 
 
-def _largest(mask: Mask, core: Mask) -> Mask:
-    """The component that contains most of the core."""
+def _moving(mask: Mask, core: Mask, seeds: Mask) -> Mask:
+    """The component that contains most of the core, and others that move (seeds): veins divide tissue."""
     count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    return np.asarray(label == 1 + np.argmax(np.bincount(label[core], minlength=count)[1:]))
+    largest = 1 + np.argmax(np.bincount(label[core], minlength=count)[1:])
+    moved = np.bincount(label[seeds & mask], minlength=count)
+    kept = np.flatnonzero(moved > Limits.part * moved[largest])
+    return np.asarray(np.isin(label, [largest, *kept[kept > 0]]))
 
 
 def _filled(mask: Mask) -> Mask:
