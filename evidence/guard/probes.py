@@ -135,13 +135,16 @@ def probe_truth() -> Arrays:
 
 
 def probe_flow() -> Arrays:
-    """Masks and recovered flow of a stored recording."""
+    """Masks and recovered flow of a stored recording, whose motion is below 2 px, and flow of up to 15 px."""
     left, blocked, tissue = _stored_pictures("stereo", "frames")
     track = synth.recover_flow(left, blocked, tissue)
+    far = synth.recover_flow(*_moved_far(left[0]), np.ones_like(tissue))
     classes = [segment(left[0], picture) for picture in left]
     return {
         "flow": track.flow,
         "confidence": track.confidence,
+        "large flow": far.flow,
+        "confidence of large flow": far.confidence,
         "instrument": np.stack([one.instrument for one in classes]),
         "highlight": np.stack([one.highlight for one in classes]),
     }
@@ -284,6 +287,23 @@ def _stored_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:
     for file in (home / "masks").glob("*.png") if folder == "frames" else ():
         masks[int(file.stem)] = _read(file)[..., 0] > 0
     return pictures, masks, _read(home / "tissue.png")[..., 0] > 0
+
+
+def _moved_far(rest: Pixels) -> tuple[Pixels, Mask]:
+    """A picture (H, W, 3) pulled by 0 to 15 px under a bar, in four frames, and the bar (4, H, W)."""
+    height, width = rest.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    middle = width / 2, height / 2
+    reach = np.exp(-((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / (0.08 * height**2))
+    pictures, bars = [], []
+    for px in (0, 5, 10, 15):
+        along, down = 0.8 * px, 0.6 * px
+        picture = cv2.remap(rest, x - along * reach, y - down * reach, cv2.INTER_CUBIC)
+        bar = (np.abs(x - middle[0] - along) < 0.05 * width) & (y < middle[1] + down) & (px > 0)
+        picture[bar] = (150, 155, 160)
+        pictures.append(picture)
+        bars.append(bar)
+    return np.stack(pictures), np.stack(bars)
 
 
 def _read(file: Path) -> Pixels:
