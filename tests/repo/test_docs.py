@@ -91,7 +91,7 @@ def test_every_command_has_help_and_examples_that_parse(
                 command.click.make_context(words[-1], typed[len(words) : end])
 
 
-METHODS = "network and physics", "physics", "mean |flow|"  # columns of the README's table
+METHODS = "network and physics", "physics", "D2FNet", "mean |flow|"  # columns of the README's table
 
 
 def test_figures_of_the_readme_are_those_of_stored_results() -> None:
