@@ -157,7 +157,7 @@ def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: M
             r, g, b = linear[y, x, 0] * steps, linear[y, x, 1] * steps, linear[y, x, 2] * steps
             for k, curve in enumerate((red, green, blue)):
                 at = matrix[k, 0] * r + matrix[k, 1] * g + matrix[k, 2] * b
-                at = min(max(at, np.float32(0)), most)
+                at = min(at, most) if at > 0 else np.float32(0)  # also where it is no number
                 low = np.int32(at)
                 video[y, x, k] = curve[low] + (at - np.float32(low)) * (curve[low + 1] - curve[low])
 

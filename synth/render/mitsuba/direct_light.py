@@ -65,7 +65,11 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
         scattered = weight * si.bsdf(ray).eval(mi.BSDFContext(), si, si.to_local(lamp.d), hit)
         # Lamps are small, so shadow rays of neighbours are as coherent as the paths: 8% of the whole trace.
         shadow = hit & scene.ray_test(si.spawn_ray_to(lamp.p), True, hit)
-        radiance = si.emitter(scene).eval(si) + dr.select(shadow, 0, scattered)
+        # Where a fine part of an object is hit edge-on, its own light or reflection may be undefined.
+        emitted, scattered = (
+            dr.select(dr.isfinite(light), light, 0) for light in (si.emitter(scene).eval(si), scattered)
+        )
+        radiance = emitted + dr.select(shadow, 0, scattered)
         depth = dr.dot(si.p - lens.centre, lens.rows[2])
         blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
         steel = hit & (dr.reinterpret_array(mi.UInt32, si.shape) == number)

@@ -138,3 +138,11 @@ def test_the_sensor_is_the_chain_of_its_parts() -> None:
     off = record(radiance, sensor, np.random.default_rng(1)).astype(int) - wanted
     assert abs(off).max() <= 1, "sums of three products round in another order"
     assert (off != 0).mean() < 1e-3
+
+
+def test_light_that_is_no_number_is_black() -> None:
+    light = np.array([[[np.nan] * 3, [0.5] * 3, [-np.inf] * 3]], np.float32)
+    video = processed(light, *CAMERAS[0])
+    assert np.isfinite(video).all()
+    assert (video[0, [0, 2]] == 0).all()
+    assert (video[0, 1] > 0).all()
