@@ -23,8 +23,8 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile
 # uv needs a third of pip's time. It reads none of pip's settings, so the indexes are handed over; where it fails, pip installs.
 INDEXES = $$($(BIN)/python -m pip config list | sed -nE "s/^.*\.((extra-)?index-url|find-links)='(.*)'/\1 \3/p" | \
 	  awk '{for (i = 2; i <= NF; i++) print "--" $$1, $$i}')
-INSTALL = { $(PIP) uv && $(BIN)/uv pip install -q --python $(BIN)/python --index-strategy unsafe-best-match $(INDEXES) \
-	  -c constraints.txt $(1) 2>/dev/null || $(PIP) $(1); }
+INSTALL = { { $(PIP) uv && $(BIN)/uv pip install -q --python $(BIN)/python --index-strategy unsafe-best-match $(INDEXES) \
+	  -c constraints.txt $(1); } 2>/dev/null || $(PIP) $(1); }
 UNREACHABLE := { echo "the packages could not be installed: check the connection to an index of Python packages" >&2; exit 2; }
 
 # Containers often set it; then each of a hundred processes would compile every package again, for seconds.

@@ -23,9 +23,7 @@ from learn.network.channels import channels
 from synth.errors import UserError, as_user_error
 from synth.flow import onnx_network
 
-TOLERANCE = (
-    1e-3  # of the largest output: rounding reaches 1e-4 in trained networks, a wrong operation percents
-)
+TOLERANCE = 1e-3  # of the largest output: rounding reaches 1e-4, a wrong operation percents
 
 
 class Portable(nn.Module):

@@ -20,6 +20,7 @@ from ruamel.yaml import YAML
 from bench.recording.from_sequence import export_recording
 from bench.recording.meta import Meta
 from synth.dataset.store import Dataset
+from synth.job.reader import names
 from synth.job.schema import Job
 
 DOCS = generate.DOCS
@@ -89,6 +90,12 @@ def test_every_command_has_help_and_examples_that_parse(
             end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
             if not command.group:
                 command.click.make_context(words[-1], typed[len(words) : end])
+
+
+def test_the_help_of_a_job_names_every_job(commands: dict[tuple[str, ...], generate.Command]) -> None:
+    (source,) = (param for param in commands["synth", "render"].click.params if param.name == "job")
+    assert source.help
+    assert set(re.findall(r"[\w-]+", source.help.partition("named job:")[2])) == set(names())
 
 
 METHODS = "network and physics", "physics", "D2FNet", "mean |flow|"  # columns of the README's table

@@ -153,7 +153,7 @@ class TissueSearch:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
         near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
         tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
-        tissue = _moving(_with_hidden(tissue, seeds, hidden), core, seeds)
+        tissue = _keep_moving(_with_hidden(tissue, seeds, hidden), core, seeds)
         tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
         hull = _hull(tissue)
         return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
@@ -245,13 +245,12 @@ def _hull(mask: Mask) -> Mask:
     return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0)
 
 
-def _moving(mask: Mask, core: Mask, seeds: Mask) -> Mask:
+def _keep_moving(mask: Mask, core: Mask, seeds: Mask) -> Mask:
     """The component that contains most of the core, and others that move (seeds): veins divide tissue."""
     count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     largest = 1 + np.argmax(np.bincount(label[core], minlength=count)[1:])
     moved = np.bincount(label[seeds & mask], minlength=count)
-    kept = np.flatnonzero(moved > Limits.part * moved[largest])
-    return np.asarray(np.isin(label, [largest, *kept[kept > 0]]))
+    return np.asarray(np.isin(label, [largest, *np.flatnonzero(moved > Limits.part * moved[largest])]))
 
 
 def _filled(mask: Mask) -> Mask:
