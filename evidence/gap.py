@@ -339,6 +339,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             words[-1] += "; there is no gap to close."
             continue
         words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap"
+        if "S" in kinds:
+            words[-1] += f", the control {_closed(closes['S'])}"
         if "N" in kinds:
             low, high = (100 * end for end in at_place["noise_less_real"][1:])
             words[-1] += (
@@ -346,6 +348,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
                 f"{low:.2g} to {high:.2g} percentage points)"
             )
         words[-1] += "."
+        if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
+            words[-1] += " There its error is not below that of no force: nothing follows from these shares."
     tables = []
     for heading, errors, factor in (
         ("Errors as shares of the mean force", found["errors"], 100.0),
@@ -374,7 +378,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             *words,
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
-            "(a control) on recovered flow with the forces of other sequences. The ideal flow of recordings "
+            "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
+            "none: what it closes is closed without any knowledge of the force. The ideal flow of recordings "
             "by felupe and Blender's Cycles is that of the contacts alone. Errors are of the total force, as "
             "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
             f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. Where an error "

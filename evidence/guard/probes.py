@@ -64,7 +64,7 @@ _PICTURES: dict[str, list[str]] = {
     ],
     "randomized": ["seed=4", "randomize.texture=1", "randomize.surroundings=1", "randomize.light=1"],
 }
-_TRUTH = ("flow", "visible", "tool", "glare", "depth", "traction", "motion", "shadow", "force")
+_TRUTH = ("flow", "visible", "tool", "depth", "traction", "motion", "force")
 
 
 @dataclass(frozen=True)
@@ -110,18 +110,21 @@ def probe_mechanics() -> Arrays:
 
 
 def probe_picture() -> Arrays:
-    """Pictures of both cameras, of a usual and of a randomised scene."""
+    """Pictures of both cameras, highlights and shadows, of a usual and of a randomised scene."""
     arrays: Arrays = {}
     for name, keys in _PICTURES.items():
         frames = _frames(keys)
         arrays[f"{name}: left"] = np.stack([frame.rgb for frame in frames])
+        arrays[f"{name}: highlights"] = np.stack([frame.glare for frame in frames])
+        if frames[0].shadow is not None:
+            arrays[f"{name}: shadows"] = np.stack([np.asarray(frame.shadow) for frame in frames])
         if frames[0].rgb_right is not None:
             arrays[f"{name}: right"] = np.stack([np.asarray(frame.rgb_right) for frame in frames])
     return arrays
 
 
 def probe_truth() -> Arrays:
-    """Labels on the pixels of a scene with two cameras, and the poses of the camera."""
+    """Labels of geometry and force on the pixels of a scene with two cameras, and the poses of the camera."""
     frames = _frames(_PICTURES["stereo"])
     arrays: Arrays = {}
     for name in _TRUTH:
