@@ -104,8 +104,7 @@ class Example:
     @property
     def error(self) -> Floats:
         """(n,) of the used frames: true less estimated size, over the largest estimate."""
-        size = np.linalg.norm(self.video.leading_mn, axis=1)
-        return np.asarray(((self.true_mn - size) / max(self.video.largest_mn, 1e-9))[self.used])
+        return np.asarray(((self.true_mn - self.video.size_mn) / max(self.video.largest_mn, 1e-9))[self.used])
 
     @property
     def features(self) -> Floats:
@@ -225,7 +224,7 @@ def read_examples(folder: Path) -> list[Example]:
             if "true_mn" not in stored:
                 continue
             video = VideoEstimates(
-                leading_mn=stored["leading_mn"],
+                size_mn=stored["size_mn"],
                 network_mn=stored["network_mn"],
                 physics_mn=stored["physics_mn"],
                 spread_mn=stored["spread_mn"],
@@ -308,7 +307,7 @@ def _judge(one: Example, table: IntervalTable) -> dict[str, float]:
     """Of one recording, over its largest true force: share that its interval holds, width, interval score
     (Gneiting and Raftery, JASA 102, 2007, eq. 43), error; and whether it has a number."""
     low, high = (end[one.used] for end in table.bound(one.video, 0.0))
-    true, size = one.true_mn[one.used], np.linalg.norm(one.video.leading_mn, axis=1)[one.used]
+    true, size = one.true_mn[one.used], one.video.size_mn[one.used]
     peak = float(true.max())
     return {
         "holds": float(((low <= true) & (true <= high)).mean()),
@@ -339,7 +338,7 @@ def _constant(examples: Sequence[Example], half: float) -> float:
     """Mean interval score with a half width of this share of the largest estimate everywhere."""
     scores = []
     for one in examples:
-        size, true = np.linalg.norm(one.video.leading_mn, axis=1)[one.used], one.true_mn[one.used]
+        size, true = one.video.size_mn[one.used], one.true_mn[one.used]
         wide = half * one.video.largest_mn
         scores.append(_interval_score(np.maximum(size - wide, 0), size + wide, true).mean() / true.max())
     return float(np.mean(scores))

@@ -67,7 +67,9 @@ class Fusion:
             # The weight is in 0..1: components that lose weight must not move the estimate beyond both.
             share = float((both.mean - physics.force_mn) @ off) / max(square, 1e-12)
             weight = min(max(share, 0.0), 1.0)
-            fused.append(ForceEstimate(both.mean + (weight - share) * off))
+            mean = both.mean + (weight - share) * off
+            # What neither sees stays as likely as physics has it, however sure the network is.
+            fused.append(ForceEstimate(mean, expected_mn=prior.centred(mean).mean_size))
             pulled, apart = pulled + weight * square, apart + square
         self._share = pulled / apart if apart else 0.0
         return fused
@@ -98,7 +100,7 @@ class Fusion:
             np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
         )
         spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
-        leading = np.array([estimate.force_mn for estimate in fused])
+        leading = np.array([estimate.size_mn for estimate in fused])
         self.video = VideoEstimates(leading, by_network, by_physics, spread, motion_mm, cameras, stated)
         self._reason = table.find_reason(self.video, network, scene.recovered_by)
         if self._reason:

@@ -51,7 +51,7 @@ NORMAL = 1.645  # 95% quantile of the normal distribution: half of the 90% inter
 class VideoEstimates:
     """The forces of a video's T tracked frames, and what is known of them."""
 
-    leading_mn: Floats  # (T, 3)
+    size_mn: Floats  # (T,) magnitude of the leading force
     network_mn: Floats  # (T, 3)
     physics_mn: Floats  # (T, 3)
     spread_mn: Floats  # (T,) standard deviation of physics' posterior
@@ -62,8 +62,8 @@ class VideoEstimates:
 
     @property
     def largest_mn(self) -> float:
-        """The largest leading force."""
-        return float(np.quantile(np.linalg.norm(self.leading_mn, axis=1), _LARGEST))
+        """The largest leading force's magnitude."""
+        return float(np.quantile(self.size_mn, _LARGEST))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class IntervalTable:
 
     def bound(self, video: VideoEstimates, gain: float) -> tuple[Floats, Floats]:
         """Lower and upper ends (T,) mN. `gain`: relative standard deviation of every force, from E."""
-        model, size = self.by_cameras[video.cameras], np.linalg.norm(video.leading_mn, axis=1)
+        model, size = self.by_cameras[video.cameras], video.size_mn
         half = video.largest_mn * model.error.predict(describe(video))
         common = NORMAL * gain * size
         low = size - np.hypot(model.below * half, common)
@@ -141,7 +141,7 @@ def read_table() -> IntervalTable:
 
 def describe(video: VideoEstimates) -> Floats:
     """Features (T, F) of a video's frames, in the order of `NAMES`."""
-    size, most = np.linalg.norm(video.leading_mn, axis=1), max(video.largest_mn, 1e-9)
+    size, most = video.size_mn, max(video.largest_mn, 1e-9)
     apart = np.linalg.norm(video.network_mn - video.physics_mn, axis=1)
     whole = max(_rms(size), 1e-9)
     moves = np.ptp(video.motion_mm) > 0 and np.ptp(size) > 0

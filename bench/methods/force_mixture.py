@@ -29,6 +29,15 @@ class ForceMixture:
         """(3,)."""
         return np.asarray(self.weight @ self.force, np.float64)
 
+    @property
+    def mean_size(self) -> float:
+        """Mean of the magnitude, by reproducible draws."""
+        return float(np.linalg.norm(_draw(self), axis=1).mean())
+
+    def centred(self, mean: Floats) -> ForceMixture:
+        """The distribution moved so that its mean is `mean` (3,)."""
+        return replace(self, force=self.force + (mean - self.mean))
+
     def times(self, factor: float) -> ForceMixture:
         """The distribution of forces `factor` times as large."""
         return replace(self, force=factor * self.force, covariance=factor**2 * self.covariance)
@@ -78,21 +87,25 @@ def size_interval(force: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
     camera it then ends at the 98th percentile, as pressing along the optical axis hardly shows.
     """
     if force.world is not None and len(worlds := np.unique(force.world)) > 1:
-        size = float(np.linalg.norm(force.mean))
+        size = force.mean_size
         ends = [size_interval(force.within(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
-    size = float(np.linalg.norm(force.mean))  # may be less than most drawn magnitudes
-    weight = force.weight / force.weight.sum()
-    drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS)
-    root = np.linalg.cholesky(force.covariance + 1e-12 * np.eye(3))
-    normal, factor = _normals()
-    forces = force.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)
-    sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * factor)
+    size, forces = force.mean_size, _draw(force)
+    sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * _normals()[1])
     spread = np.cov(forces.T) + 1e-12 * np.eye(3)
     if force.mean @ np.linalg.solve(spread, force.mean) < _SURELY:
         return 0.0, max(float(np.quantile(sizes, 0.9 if cameras == 2 else 0.98)), size)
     low, high = np.quantile(sizes, (0.05, 0.95))
     return min(float(low), size), max(float(high), size)
+
+
+def _draw(force: ForceMixture) -> Floats:
+    """Forces (N, 3) of a distribution, the same at every call."""
+    weight = force.weight / force.weight.sum()
+    # The sum may round to less than the last draw's place.
+    drawn = np.searchsorted(np.cumsum(weight)[:-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
+    root = np.linalg.cholesky(force.covariance + 1e-12 * np.eye(3))
+    return np.asarray(force.force[drawn] + np.einsum("nab,nb->na", root[drawn], _normals()[0]))
 
 
 @lru_cache(maxsize=1)

@@ -58,9 +58,15 @@ class ForceEstimate:
     """Upper end."""
     likely: ForceMixture | None = None
     """Probability distribution of the force, for a fusion of methods; without the uncertainty of E."""
+    expected_mn: float = math.nan
+    """Mean of the force's magnitude over what is likely: more than that of the mean, `force_mn`, which
+    is without the components that the motion does not show. NaN: not known."""
 
     @property
     def size_mn(self) -> float:
+        """The force's magnitude: its mean where that is known, else that of `force_mn`."""
+        if np.isfinite(self.expected_mn):
+            return self.expected_mn
         return float(np.sqrt(np.nansum(self.force_mn**2)))
 
 

@@ -210,7 +210,8 @@ class Physics:
         likely = answer.force.times(young).with_gain(
             float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
         )
-        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely)
+        size = young * answer.force.mean_size
+        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely, size)
 
     def _picture(self, answer: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""

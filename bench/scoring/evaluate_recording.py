@@ -139,12 +139,13 @@ def _score_methods(
     scored: dict[str, Scored] = {}
     for name, method in methods.items():
         force, gain = np.array(against.tracked.force_mn[name], np.float64), None
+        size = np.array(against.tracked.size_mn[name], np.float64)
         first = scored.get(against.main)
-        force[against.lost] = np.nan
+        force[against.lost], size[against.lost] = np.nan, np.nan
         if isinstance(method, FlowSize):
-            gain = _fit_gain(_magnitude(force), first, against, press)
-            force *= gain.mn_per_mm
-        one = replace(_score(force, first, against, press, in_camera_axes), gain=gain)
+            gain = _fit_gain(size, first, against, press)
+            force, size = gain.mn_per_mm * force, gain.mn_per_mm * size
+        one = replace(_score(force, size, first, against, press, in_camera_axes), gain=gain)
         scored[name] = _with_interval(one, name, against)
     return scored
 
@@ -161,10 +162,18 @@ def _fit_gain(size: Floats, first: Scored | None, against: Result, press: Mask |
 
 
 def _score(
-    force: Floats, first: Scored | None, against: Result, press: Mask | None, in_camera_axes: bool
+    force: Floats,
+    size: Floats,
+    first: Scored | None,
+    against: Result,
+    press: Mask | None,
+    in_camera_axes: bool,
 ) -> Scored:
-    """Scores one method's force (T, 3) against the sensor; `first`: the main method, if this is another."""
-    size, sensor, used = _magnitude(force), against.sensor_mn, against.scored
+    """Scores one method's force (T, 3) and its magnitude (T,) against the sensor.
+
+    `first`: the main method, if this is another.
+    """
+    sensor, used = against.sensor_mn, against.scored
     axes = against.sensor_axes_mn
     if sensor is None or axes is None:
         return Scored(force, size)
@@ -208,10 +217,3 @@ def _with_interval(scored: Scored, name: str, against: Result) -> Scored:
 
 def _mean(values: Array) -> float:
     return float(values.mean()) if len(values) else math.nan
-
-
-def _magnitude(force: Floats) -> Floats:
-    """Magnitude of each force from its finite components, (T,) mN."""
-    size = np.sqrt(np.nansum(force**2, axis=1))
-    size[~np.isfinite(force).any(axis=1)] = np.nan
-    return np.asarray(size, np.float64)

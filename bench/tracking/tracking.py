@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -55,6 +56,7 @@ class TrackedRecording:
     frame: list[int] = field(default_factory=list)  # numbers in the recording
     time_s: list[float] = field(default_factory=list)
     force_mn: dict[str, list[Floats]] = field(default_factory=dict)  # by method: (3,) each
+    size_mn: dict[str, list[float]] = field(default_factory=dict)  # by method: magnitude
     bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # by method: low, high
     speed: list[float] = field(default_factory=list)  # mean over the tissue since the previous frame [mm/s]
     confidence: list[float] = field(default_factory=list)  # mean over the tissue
@@ -268,6 +270,7 @@ class _Forces:
                 for frame in self.estimates:
                     frame.setdefault(name, frame[method.parts[0]])
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
+            self.out.size_mn[name] = [_measure(frame[name]) for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
 
     def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
@@ -280,6 +283,11 @@ class _Forces:
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2
+
+
+def _measure(estimate: ForceEstimate) -> float:
+    """Magnitude of an estimate; NaN where it has no component."""
+    return estimate.size_mn if np.isfinite(estimate.force_mn).any() else math.nan
 
 
 def _find_stated(recording: Recording, scene: MethodContext) -> tuple[bool, ...]:

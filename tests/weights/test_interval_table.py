@@ -26,7 +26,7 @@ def draw(make: int, number: int) -> Example:
     )
     parts = both[..., None] * way
     spread = apart * curve + 0.02 * curve.max()
-    video = VideoEstimates(parts.mean(axis=0), *parts, spread, 0.02 * curve, 2, float(number % 2))
+    video = VideoEstimates(np.abs(both).mean(axis=0), *parts, spread, 0.02 * curve, 2, float(number % 2))
     return Example(f"make {make}", str(number), video, curve)
 
 
@@ -56,7 +56,7 @@ def test_new_videos_are_held_and_widths_follow_the_disagreement(table: IntervalT
 def test_an_uncertain_stiffness_widens_it_in_proportion_to_the_force(table: IntervalTable) -> None:
     video = draw(0, 0).video
     (low, high), (lower, higher) = table.bound(video, 0.0), table.bound(video, 0.5)
-    size = np.linalg.norm(video.leading_mn, axis=1)
+    size = video.size_mn
     np.testing.assert_allclose(higher - size, np.hypot(high - size, 1.645 * 0.5 * size))
     assert (lower <= low).all()
 

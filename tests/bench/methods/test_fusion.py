@@ -44,6 +44,19 @@ def test_components_that_contradict_the_network_lose_weight() -> None:
     np.testing.assert_allclose(found.weight, [1 / (1 + odds), odds / (1 + odds)])
 
 
+def test_the_magnitude_counts_the_component_that_the_motion_does_not_show() -> None:
+    even = ForceMixture(np.ones(1), np.zeros((1, 3)), 4.0 * np.eye(3)[None])
+    np.testing.assert_allclose(even.mean_size, 2 * np.sqrt(8 / np.pi), rtol=0.04)  # Maxwell's distribution
+    z = np.linspace(-8, 8, 4001)
+    hidden = np.trapezoid(np.hypot(3, 4 * z) * np.exp(-(z**2) / 2), z) / np.sqrt(2 * np.pi)
+    flat = ForceMixture(np.ones(1), np.array([[3.0, 0, 0]]), np.diag([1e-4, 1e-4, 16.0])[None])
+    np.testing.assert_allclose(flat.mean_size, hidden, rtol=0.04)
+    sure = estimate([np.array([3.0, 0, 0])], [1e-3], [1.0])
+    fused = fuse_one(sure, ForceEstimate(flat.mean, likely=flat))
+    np.testing.assert_allclose(np.linalg.norm(fused.force_mn), 3.0, rtol=0.01)
+    np.testing.assert_allclose(fused.size_mn, hidden, rtol=0.04)
+
+
 def test_without_a_calibrated_network_there_is_no_interval_but_a_reason() -> None:
     every = [estimate([np.array([size, 0.0, 0.0])], [0.01], [1.0]) for size in (10.0, 0.3, 1.0)]
     frames, fusion = [{"network": o, "physics": o} for o in every], Fusion("network", "physics")

@@ -171,7 +171,7 @@ def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
     result = run(make())
     curve = result.methods["bump"].size_mn
     way = curve[:, None] * np.array([1.0, 0.0, 0.0])
-    one = VideoEstimates(way, way, way, 0.1 * curve, 0.01 * curve, 1, 0.5)
+    one = VideoEstimates(curve, way, way, 0.1 * curve, 0.01 * curve, 1, 0.5)
     result.tracked.evidence, result.tracked.stated = one, (True, False, True, False)
     gains = find_gains(result, 10.0, 6.0, 14.0)
     ratios = read_table().stating
