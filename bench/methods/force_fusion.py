@@ -69,7 +69,7 @@ class Fusion:
             weight = min(max(share, 0.0), 1.0)
             mean = both.mean + (weight - share) * off
             # What neither sees stays as likely as physics has it, however sure the network is.
-            fused.append(ForceEstimate(mean, expected_mn=prior.centred(mean).mean_size))
+            fused.append(ForceEstimate(mean, expected_mn=prior.centred(mean).find_size(cameras)))
             pulled, apart = pulled + weight * square, apart + square
         self._share = pulled / apart if apart else 0.0
         return fused

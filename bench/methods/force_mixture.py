@@ -34,6 +34,11 @@ class ForceMixture:
         """Mean of the magnitude, by reproducible draws."""
         return float(np.linalg.norm(_draw(self), axis=1).mean())
 
+    def find_size(self, cameras: int) -> float:
+        """The estimate of the magnitude: its mean with one camera, which does not show force along its line of
+        sight, so that the mean force is without it; with two that of the mean force, as noise only adds."""
+        return self.mean_size if cameras == 1 else float(np.linalg.norm(self.mean))
+
     def centred(self, mean: Floats) -> ForceMixture:
         """The distribution moved so that its mean is `mean` (3,)."""
         return replace(self, force=self.force + (mean - self.mean))
@@ -87,10 +92,10 @@ def size_interval(force: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
     camera it then ends at the 98th percentile, as pressing along the optical axis hardly shows.
     """
     if force.world is not None and len(worlds := np.unique(force.world)) > 1:
-        size = force.mean_size
+        size = force.find_size(cameras)
         ends = [size_interval(force.within(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
-    size, forces = force.mean_size, _draw(force)
+    size, forces = force.find_size(cameras), _draw(force)
     sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * _normals()[1])
     spread = np.cov(forces.T) + 1e-12 * np.eye(3)
     if force.mean @ np.linalg.solve(spread, force.mean) < _SURELY:

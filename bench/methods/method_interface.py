@@ -59,12 +59,12 @@ class ForceEstimate:
     likely: ForceMixture | None = None
     """Probability distribution of the force, for a fusion of methods; without the uncertainty of E."""
     expected_mn: float = math.nan
-    """Mean of the force's magnitude over what is likely: more than that of the mean, `force_mn`, which
-    is without the components that the motion does not show. NaN: not known."""
+    """Estimate of the magnitude, with one camera its mean over what is likely: more than that of `force_mn`,
+    which is without what the motion does not show. NaN: that of `force_mn`."""
 
     @property
     def size_mn(self) -> float:
-        """The force's magnitude: its mean where that is known, else that of `force_mn`."""
+        """The force's magnitude: `expected_mn` where it is known, else that of `force_mn`."""
         if np.isfinite(self.expected_mn):
             return self.expected_mn
         return float(np.sqrt(np.nansum(self.force_mn**2)))

@@ -210,7 +210,7 @@ class Physics:
         likely = answer.force.times(young).with_gain(
             float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
         )
-        size = young * answer.force.mean_size
+        size = young * answer.force.find_size(cameras)
         return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely, size)
 
     def _picture(self, answer: Posterior) -> Field:

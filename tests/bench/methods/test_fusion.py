@@ -52,9 +52,11 @@ def test_the_magnitude_counts_the_component_that_the_motion_does_not_show() -> N
     flat = ForceMixture(np.ones(1), np.array([[3.0, 0, 0]]), np.diag([1e-4, 1e-4, 16.0])[None])
     np.testing.assert_allclose(flat.mean_size, hidden, rtol=0.04)
     sure = estimate([np.array([3.0, 0, 0])], [1e-3], [1.0])
-    fused = fuse_one(sure, ForceEstimate(flat.mean, likely=flat))
-    np.testing.assert_allclose(np.linalg.norm(fused.force_mn), 3.0, rtol=0.01)
-    np.testing.assert_allclose(fused.size_mn, hidden, rtol=0.04)
+    frames = [{"network": sure, "physics": ForceEstimate(flat.mean, likely=flat)}]
+    for cameras, size in ((1, hidden), (2, 3.0)):
+        (fused,) = Fusion("network", "physics").fuse(frames, SCENE, cameras)
+        np.testing.assert_allclose(np.linalg.norm(fused.force_mn), 3.0, rtol=0.01)
+        np.testing.assert_allclose(fused.size_mn, size, rtol=0.04)
 
 
 def test_without_a_calibrated_network_there_is_no_interval_but_a_reason() -> None:
