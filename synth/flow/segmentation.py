@@ -24,7 +24,7 @@ CHANNELS = 6  # of the network's input: the frame and the rest frame
 SIDE = 256  # px, longest side of the pictures in which classes are predicted: what it learnt is of one scale
 _MULTIPLE = 32  # px: the levels of the network need multiples of it on both sides
 _FOUND = 0.5  # probability above which a class is taken to be there
-HIDING = 0.9  # and above which an instrument is taken to hide tissue, whose motion would be lost (design.md)
+_HIDING = 0.9  # and above which an instrument is taken to hide tissue, whose motion would be lost (design.md)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Segmentation:
     @property
     def hidden(self) -> Mask:
         """(H, W) where an object or a highlight hides the tissue, and a pixel around."""
-        return _grown((self.instrument > HIDING) | (self.highlight > _FOUND))
+        return _grown((self.instrument > _HIDING) | (self.highlight > _FOUND))
 
     @property
     def shines(self) -> Mask:
@@ -53,7 +53,7 @@ class Segmentation:
     def expect(self, there: Mask) -> Segmentation:
         """The classes where an object is expected (H, W): its odds there are those of 0.9 where they were
         even."""
-        odds = HIDING / (1 - HIDING)
+        odds = _HIDING / (1 - _HIDING)
         likely = odds * self.instrument / (1 + (odds - 1) * self.instrument)
         return replace(self, instrument=np.where(there, likely, self.instrument).astype(np.float32))
 
