@@ -63,7 +63,7 @@ class RestEvidence:
 def align(frame: Pixels, rest: Pixels, instrument: Map) -> tuple[Pixels, Map]:
     """The rest frame (h, w, 3) uint8 and the probability of instruments there (h, w) at the pixels of a frame
     of its size, by a coarse flow (T. Kroeger et al., ECCV 2016)."""
-    solver = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver = _cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     back = solver.calc(_contrast(frame), _contrast(rest), np.zeros((*rest.shape[:2], 2), np.float32))
     side = Limits.across_px
     smooth = cv2.blur(np.dstack([cv2.medianBlur(plane, side) for plane in cv2.split(back)]), (side, side))

@@ -47,12 +47,13 @@ class MaskFrame:
             if self._tool is None:
                 if self._lookalikes is not None:
                     found = self._lookalikes.remove(found, frame.rgb)
+                looks = self._weigh(found, frame)
                 if frame.is_rest:
                     self._evidence = RestEvidence(self._rest.rgb, found)
                 elif self._evidence is not None:
                     found = self._evidence.weigh(found, frame.rgb)
-                found = self._weigh(found, frame)
-                masked, tool = _plausible(found, self._rest.tissue), found.objects
+                # Shadows change the picture too: with their odds raised, instruments are taken for hands.
+                masked, tool = _plausible(self._weigh(found, frame), self._rest.tissue), looks.objects
             else:
                 given = self._tool(frame.index, self._rest.size)
                 tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
