@@ -28,7 +28,7 @@ class Limits:
     """Chosen by hand on 18 videos by Cycles, and on renders and photographs with instruments."""
 
     side: int = 160  # px, longest side of the pictures that are compared
-    smallest: int = 16  # px a side that the coarse flow's pyramid needs
+    smallest: int = 64  # px a side: the coarse flow reads beyond pictures with less than 32
     factor: float = 5.0  # of odds; with 9 the motion at contacts that renders show is less by another 1%
     changed: float = 6.4  # grey levels over the picture's median change from which it has changed
     same: float = 4.0  # the same, below which it has not
