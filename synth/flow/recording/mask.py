@@ -12,6 +12,7 @@ from synth.arrays import Mask, Pixels
 from synth.flow.lookalike import Lookalikes
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
 from synth.flow.recording.picture_faults import find_fault
+from synth.flow.rest_evidence import RestEvidence
 from synth.flow.segmentation import Segmentation, segment
 from synth.video.read_video import shrink_mask
 
@@ -32,6 +33,7 @@ class MaskFrame:
         """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected;
         `expected`: where, see `Footage`; `lookalikes`: likewise."""
         self._rest, self._kind, self._tool, self._expected = rest, kind, tool, expected
+        self._evidence: RestEvidence | None = None  # from the rest frame on
         self._lookalikes: Lookalikes | None = None
         if lookalikes is not None and lookalikes.any():
             self._lookalikes = Lookalikes(rest.rgb, _resized(lookalikes, rest.tissue.shape))
@@ -45,8 +47,13 @@ class MaskFrame:
             if self._tool is None:
                 if self._lookalikes is not None:
                     found = self._lookalikes.remove(found, frame.rgb)
-                found = self._weigh(found, frame)
-                masked, tool = _plausible(found, self._rest.tissue), found.objects
+                looks = self._weigh(found, frame)
+                if frame.is_rest:
+                    self._evidence = RestEvidence(self._rest.rgb, found)
+                elif self._evidence is not None:
+                    found = self._evidence.weigh(found, frame.rgb)
+                # Shadows change the picture too: with their odds raised, instruments are taken for hands.
+                masked, tool = _plausible(self._weigh(found, frame), self._rest.tissue), looks.objects
             else:
                 given = self._tool(frame.index, self._rest.size)
                 tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
@@ -68,9 +75,26 @@ class MaskFrame:
         return found.expect(there)
 
 
-def mask_right(rest: Pixels, rgb: Pixels, kind: str, tissue: Mask) -> Mask:
-    """Mask (H, W) of what hides the tissue in a picture of the right camera, given its rest picture."""
-    return np.zeros(tissue.shape, bool) if kind == "none" else _plausible(segment(rest, rgb), tissue)
+class MaskRight:
+    """Masks what hides the tissue in pictures of the right camera."""
+
+    def __init__(self, rest: Pixels, kind: str) -> None:
+        """Starts with its rest picture (h, w, 3) uint8; `kind`: one of `MASKS`."""
+        self._rest, self._kind = rest, kind
+        if kind != "none":
+            self._at_rest = segment(rest, rest)
+            self._evidence = RestEvidence(rest, self._at_rest)
+
+    def mask_rest(self) -> Mask:
+        """Mask (h, w) of its rest picture."""
+        everywhere = np.ones(self._rest.shape[:2], bool)
+        return ~everywhere if self._kind == "none" else _plausible(self._at_rest, everywhere)
+
+    def mask(self, rgb: Pixels, tissue: Mask) -> Mask:
+        """Mask (h, w) of a later picture (h, w, 3); `tissue`: (h, w), in its rest picture."""
+        if self._kind == "none":
+            return np.zeros(tissue.shape, bool)
+        return _plausible(self._evidence.weigh(segment(self._rest, rgb), rgb), tissue)
 
 
 def _resized(mask: Mask, size: tuple[int, ...]) -> Mask:

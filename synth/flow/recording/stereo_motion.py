@@ -13,7 +13,7 @@ from synth.errors import UserError
 from synth.flow import image
 from synth.flow.recording.camera_path import CameraTracker
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
-from synth.flow.recording.mask import mask_right
+from synth.flow.recording.mask import MaskRight
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Intrinsics, StereoRig
@@ -60,7 +60,7 @@ class RightCamera:
         self._camera: CameraTracker | None = None  # motion of the right camera
         self._noise: list[float] = []
         self._pair: tuple[Pixels, Pixels] | None = None  # of the last tracked frame
-        self._first: Pixels  # right picture at rest
+        self._mask: MaskRight  # from the rest frame on
 
     @property
     def quality(self) -> StereoQuality | None:
@@ -81,8 +81,8 @@ class RightCamera:
         tissue = self._rest.tissue
         masked = frame.hidden
         if self.stereo is None or self._camera is None:
-            self._pair, self._first = (frame.rgb, right), right
-            hidden = mask_right(right, right, self._kind, np.ones_like(tissue))
+            self._pair, self._mask = (frame.rgb, right), MaskRight(right, self._kind)
+            hidden = self._mask.mask_rest()
             self.stereo = self._begin(frame.rgb, right, masked, hidden)
             self._camera = CameraTracker(right, self.stereo.right_tissue(), hidden)
             return replace(frame, right=right, motion=Moved.nothing(tissue.shape))
@@ -90,7 +90,7 @@ class RightCamera:
         view = self._camera.find(right, frame.time_s) or frame.camera
         right = right if view is None else view.undo(right)
         self._pair = frame.rgb, right
-        hidden = mask_right(self._first, right, self._kind, self.stereo.right_tissue())
+        hidden = self._mask.mask(right, self.stereo.right_tissue())
         if view is not None:
             hidden |= view.outside(tissue.shape)
         moved = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
