@@ -35,8 +35,8 @@ class ForceMixture:
         return float(np.linalg.norm(_draw(self), axis=1).mean())
 
     def find_size(self, cameras: int) -> float:
-        """The estimate of the magnitude: its mean with one camera, which does not show force along its line of
-        sight, so that the mean force is without it; with two that of the mean force, as noise only adds."""
+        """The estimate of the magnitude: with one camera its mean, as force along the line of sight does not
+        show and the mean force is without it; with two that of the mean, to which noise does not add."""
         return self.mean_size if cameras == 1 else float(np.linalg.norm(self.mean))
 
     def centred(self, mean: Floats) -> ForceMixture:
