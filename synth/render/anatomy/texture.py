@@ -71,9 +71,9 @@ class Bleeding:
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
-    absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
-    opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.74, 0.16, 0.085)  # albedo
+    absorption_per_mm: Rgb = (0.25, 5.0, 7.0)
+    opaque: tuple[float, float] = 0.28, 0.055  # depth that even fine ones reach, and the chord for 63% of it
+    wall: Rgb = (0.84, 0.2, 0.1)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims

@@ -73,21 +73,21 @@ TRIBUTARIES = (
     Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=3.0, reach=12.0, near=1.3, step=0.18, straight=1.6, end=(0.06, 0.08)),
-    Growth(spacing=1.7, reach=6.0, near=0.65, step=0.14, straight=1.6, end=(0.045, 0.058)),
-    Growth(spacing=1.0, reach=4.0, near=0.36, step=0.12, straight=1.6, end=(0.034, 0.044)),
-    Growth(spacing=0.55, reach=2.0, near=0.2, step=0.1, straight=1.4, end=(0.025, 0.031)),
+    Growth(spacing=2.4, reach=10.0, near=0.9, step=0.18, straight=1.4, end=(0.066, 0.088)),
+    Growth(spacing=1.1, reach=5.0, near=0.36, step=0.14, straight=1.2, end=(0.052, 0.066)),
+    Growth(spacing=0.6, reach=2.5, near=0.18, step=0.11, straight=1.0, end=(0.044, 0.056)),
+    Growth(spacing=0.42, reach=1.4, near=0.14, step=0.09, straight=0.8, end=(0.033, 0.042)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.22  # radius of such a vein
-_TWIG_MM = 0.65  # shorter side branches are left out: they look like thorns
-_ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
+_TWIG_MM = 0.25  # shorter side branches are left out: they look like thorns
+_ROUNDED = 10  # rounds of smoothing of what has grown in, over some 0.2 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
-_TAPER_MM = 0.9  # length over which arterioles and tributaries thin
-_POINTED = 0.010, 0.009  # radius of a free end, and by how much it grows with each mm from there
-_WIDENS = 1.03  # times, at most and besides, from a node to the next one up
-_WINDING = 0.13, 1.6  # shift of fine vessels, and over what distance
+_TAPER_MM = 0.5  # length over which arterioles and tributaries thin
+_POINTED = 0.026, 0.06  # radius of a free end, and by how much it grows with each mm from there
+_WIDENS = 1.08  # times, at most and besides, from a node to the next one up
+_WINDING = 0.15, 1.4  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
 
@@ -206,7 +206,7 @@ def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.rand
     )
     supple = shift / (1 + (tree.radius / _SUPPLE_MM) ** 2)
     left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
-    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
+    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.5, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
     short, long = (
         noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 9.0)
