@@ -53,4 +53,4 @@ class SceneContent:
     """Bodies that never move and are neither tissue nor instruments, though they hide both."""
     instruments: Instruments | None = None
     spot: float = np.inf
-    """Radius of the field that the lamps light evenly, in widths of the picture; outside light fades."""
+    """Radius of the lamps' spot, in widths of the picture, to which light falls by a third; see `light.spot`."""
