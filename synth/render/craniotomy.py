@@ -27,7 +27,7 @@ from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.065, 0.33
+_RIM_ROUGHNESS, _RIM_DRY = 0.04, 0.28
 _SEEN = 1.3  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
 _SQUARES, _RIM_MM = 64, 2.0  # across the rim's map, to tell which of it is seen; its height
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
