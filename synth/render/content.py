@@ -53,4 +53,4 @@ class SceneContent:
     """Bodies that never move and are neither tissue nor instruments, though they hide both."""
     instruments: Instruments | None = None
     spot: float = np.inf
-    """Radius of the lamps' spot, in widths of the picture, to which light falls by a third; see `light.spot`."""
+    """Radius of the lamps' spot, in widths of the picture: light falls by a third to there."""

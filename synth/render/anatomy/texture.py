@@ -71,8 +71,8 @@ class Bleeding:
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
-    absorption_per_mm: Rgb = (0.2, 4.6, 6.5)
-    opaque: tuple[float, float] = 0.28, 0.055  # depth that even fine ones reach, and the chord for 63% of it
+    absorption_per_mm: Rgb = (0.2, 4.4, 6.5)
+    opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.86, 0.22, 0.11)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's

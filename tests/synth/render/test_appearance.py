@@ -71,7 +71,7 @@ def test_the_spot_moves_with_the_microscope_and_is_the_same_for_both_cameras() -
 
 
 def test_a_spot_of_any_usual_size_leaves_the_opening_its_mean_light() -> None:
-    render = RenderSection(stereo_mm=None)
+    render = RenderSection()
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), read_lens(render))
     rows, columns = np.mgrid[: lens.size[1], : lens.size[0]]
     away = np.hypot(columns - lens.K[0, 2], rows - lens.K[1, 2]) / lens.size[0]
