@@ -108,8 +108,11 @@ def craniotomy(
             if name in appearance.scenery:
                 static += objects(around, how.scale, theatre, ground, seed, camera)
     hand = np.random.default_rng([seed, 2])
+    # In the corners of the patch, farther under the rim than at its sides.
+    corners = np.hypot(*surface.vertices[:, :2].T) > 0.5 * surface.extent_mm
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
+        hidden=corners[surface.faces].all(axis=1) if how.surroundings is None else None,
         lamps=lamps,
         static=static,
         instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),

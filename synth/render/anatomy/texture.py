@@ -107,7 +107,7 @@ class Film:
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
-    reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
+    reach_mm: tuple[float, float] = 0.12, 0.45  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.05  # standard deviation of slopes where the film is thin
     level: float = 0.15  # share of the pia's slope that a pool takes away,

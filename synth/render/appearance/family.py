@@ -48,7 +48,7 @@ class Ranges:
     """
 
     gyrus_albedo: Colour = (0.95, 0.765, 0.49)
-    perfused_albedo: Colour = (0.93, 0.57, 0.38)
+    perfused_albedo: Colour = (0.95, 0.61, 0.41)
     vein_crest_albedo: Colour = (0.31, 0.27, 0.345)
     vein_side_albedo: Colour = (0.23, 0.07, 0.085)
     arterial_absorption: Ends = (1.1, 1.5)
