@@ -330,10 +330,8 @@ def test_a_bent_bar_faces_outwards_along_its_path(sides: int) -> None:
 @pytest.mark.parametrize("kind", [*instrument.SHAPES, "clip"])
 def test_no_face_of_a_drawn_part_lacks_an_area(kind: str) -> None:
     if kind == "clip":  # its ends are closed by two rings in one place
-        s = np.array([0.0, 0.0, 0.3, 2.9, 3.2, 3.2])
-        part = instrument.Part(
-            instrument.sweep(s, *2 * [np.array([0.02, 1.0, 1.0, 1.0, 1.0, 0.02])], 0 * s, 0.8), 0
-        )
+        s, radius = np.array([0.0, 0.0, 0.3, 2.9, 3.2, 3.2]), np.array([0.02, 1.0, 1.0, 1.0, 1.0, 0.02])
+        part = instrument.Part(instrument.sweep(s, radius, radius, 0 * s, 0.8), 0)
         path = np.column_stack([s, 0 * s, 0.1 * s])
         shapes = [scenery.Bar(part, 16, path, finish.Finish((0.6, 0.6, 0.6), 0.2), kind).shape]
     else:
