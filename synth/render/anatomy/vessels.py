@@ -73,10 +73,10 @@ TRIBUTARIES = (
     Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=2.2, reach=10.0, near=0.8, step=0.18, straight=1.4, end=(0.066, 0.088)),
-    Growth(spacing=0.9, reach=4.0, near=0.27, step=0.14, straight=1.3, end=(0.054, 0.066)),
-    Growth(spacing=0.52, reach=2.5, near=0.14, step=0.12, straight=1.2, end=(0.044, 0.056)),
-    Growth(spacing=0.42, reach=1.4, near=0.14, step=0.1, straight=1.1, end=(0.033, 0.042)),
+    Growth(spacing=2.4, reach=10.0, near=0.9, step=0.18, straight=1.4, end=(0.066, 0.088)),
+    Growth(spacing=1.05, reach=4.0, near=0.33, step=0.14, straight=1.3, end=(0.05, 0.062)),
+    Growth(spacing=0.62, reach=2.5, near=0.17, step=0.12, straight=1.2, end=(0.036, 0.047)),
+    Growth(spacing=0.45, reach=1.5, near=0.15, step=0.1, straight=1.1, end=(0.026, 0.033)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
