@@ -26,7 +26,7 @@ class LightSection(Section):
     main: Range[Share] = (0.5, 0.68)
     """Share of light from the main lamp; the rest comes from one on the other side of the lens."""
     even: Range[Positive] = (0.35, 0.5)
-    """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
+    """Radius of the lamps' spot, in widths of the field: light falls smoothly, by a third to there."""
 
 
 class SensorSection(Section):

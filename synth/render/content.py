@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from synth.arrays import Floats, Indices, Map
+from synth.arrays import Floats, Indices, Map, Mask
 from synth.geometry.triangles import Shape
 from synth.render.materials import Body, FinishMaps, Lamp
 
@@ -51,6 +51,9 @@ class SceneContent:
     lamps: Sequence[Lamp]
     static: Sequence[Body] = ()
     """Bodies that never move and are neither tissue nor instruments, though they hide both."""
+    hidden: Mask | None = None
+    """(F,) of the tissue's faces those that static bodies hide from every view, and that throw no shadow that
+    is seen: left out of the picture, not of labels."""
     instruments: Instruments | None = None
     spot: float = np.inf
-    """Radius of the field that the lamps light evenly, in widths of the picture; outside light fades."""
+    """Radius of the lamps' spot, in widths of the picture: light falls by a third to there."""

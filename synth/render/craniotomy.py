@@ -27,7 +27,7 @@ from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.065, 0.33
+_RIM_ROUGHNESS, _RIM_DRY = 0.04, 0.28
 _SEEN = 1.3  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
 _SQUARES, _RIM_MM = 64, 2.0  # across the rim's map, to tell which of it is seen; its height
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
@@ -108,8 +108,11 @@ def craniotomy(
             if name in appearance.scenery:
                 static += objects(around, how.scale, theatre, ground, seed, camera)
     hand = np.random.default_rng([seed, 2])
+    # In the corners of the patch, farther under the rim than at its sides.
+    corners = np.hypot(*surface.vertices[:, :2].T) > 0.5 * surface.extent_mm
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
+        hidden=corners[surface.faces].all(axis=1) if how.surroundings is None else None,
         lamps=lamps,
         static=static,
         instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),

@@ -315,7 +315,8 @@ def _spatula(half: float) -> tuple[Part, ...]:
 def _probe(half: float) -> tuple[Part, ...]:
     """A ball on a thin shaft; at 50 degrees its lowest point is the tip."""
     s = _along()
-    radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), np.where(s > half, 0.45 * half, 0))
+    least = np.where(s > half, 0.45 * half, 0.03 * half)  # a ring of no radius would have faces without area
+    radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), least)
     radius += 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
     low, up = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
     return (Part(sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -230,7 +231,10 @@ class Renderer:
 
     def _set_stage(self, placed: _Placed, spp: int, integrator: str = "direct") -> Stage:
         vertices = placed.state.vertices
-        bodies = {"tissue": replace(self.content.tissue, vertices=vertices, film=placed.film)}
+        tissue = self.content.tissue
+        if (hidden := self.content.hidden) is not None:
+            tissue = replace(tissue, faces=tissue.faces[~hidden])
+        bodies = {"tissue": replace(tissue, vertices=vertices, film=placed.film)}
         wet = (body for body in self.content.static if isinstance(body.material, Wet))
         bodies |= {f"static{k}": body for k, body in enumerate(wet)}
         shape, glow = self._metal(placed.posed)
@@ -315,6 +319,13 @@ class Renderer:
         return [np.asarray(np.mean(taken, axis=0), np.float32) for taken in zip(*shots, strict=True)]
 
     def _spot(self, camera: Camera) -> Map:
+        return self._spot_at_rest if camera is self.camera else self._spot_of(camera)
+
+    @cached_property
+    def _spot_at_rest(self) -> Map:
+        return self._spot_of(self.camera)
+
+    def _spot_of(self, camera: Camera) -> Map:
         return light.spot(camera, self.camera, self.content.spot)
 
     def _metal(self, posed: Shape) -> tuple[Shape, Floats]:
@@ -328,7 +339,9 @@ class Renderer:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""
         height, width = radiance.shape[:2]
         tissue = self.content.tissue
-        on = (hits.face >= 0) & (hits.face < len(tissue.faces))
+        level = _mean(radiance.reshape(-1, 3)) * self._sensor.exposure
+        # Of darker pixels, which are most, the diffuse part doesn't matter.
+        on = np.flatnonzero((hits.face >= 0) & (hits.face < len(tissue.faces)) & (level > _GLARE))
         face, bary = hits.face[on], hits.bary[on]
         uv = truth.blend(tissue.faces, face, bary, tissue.uv)
         albedo = noise.sample(self._wet.maps.albedo, uv - 0.5, 1.0)
@@ -342,9 +355,8 @@ class Renderer:
         light_in = truth.blend(tissue.faces, face, bary, state.power * irradiance)
         spot = self._spot(state.camera or self.camera).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
-        excess = _mean(radiance.reshape(-1, 3))[on] - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
-        glare[on] = excess * self._sensor.exposure > _GLARE
+        glare[on] = level[on] - 1.05 * self._sensor.exposure * diffuse > _GLARE
         return glare.reshape(height, width)
 
 

@@ -175,6 +175,11 @@ class Bar:
     @property
     def shape(self) -> Shape:
         ahead = np.gradient(self.path, axis=0)
+        # Two rings in one place close an end: without a direction the outer one would fall flat, into faces
+        # without area, whose light is undefined.
+        for end, inner in ((0, 1), (-1, -2)):
+            if not ahead[end].any():
+                ahead[end] = ahead[inner]
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
         # Upwards where it is level, so that the shown half of its texture faces the microscope.
         aside = np.cross(ahead, [0.0, 0.0, 1.0])

@@ -50,7 +50,7 @@ class CutEdge:
     painted: tuple[float, ...] = (-2.6, -1.1, -0.8, -0.5, -0.2)  # radii of its rings in the texture
     top: tuple[float, float] = 0.12, 0.3  # start of the dura's outer face: outwards, over the brain
     albedo: Rgb = (0.9, 0.7, 0.58)  # of its section
-    width: float = 0.3
+    width: float = 0.2
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
 
@@ -74,8 +74,10 @@ class Dura:
         2.1,
         2.8,
     )  # height, waves per mm aside, reach of those at a stitch
-    soaked: tuple[float, float] = 1.6, 1.1  # its blood by the level, and by chance from place to place,
-    stained: tuple[float, float] = 0.75, 2.4  # more outwards, over what distance
+    soaked: tuple[float, float] = 2.0, 1.2  # its blood by the level, and by chance from place to place,
+    stained: tuple[float, float] = 1.3, 0.5  # more towards its end, and the part of it that stays clean
+    taut: tuple[float, float] = 0.03, 3.2  # height of the creases that its pull draws along the edge, waves
+    # per mm across them, about ten times as many as along
     vessels: tuple[float, float] = 0.055, 0.5  # width of its vessels in the noise, and their optical depth
     thin: Rgb = (0.2, 0.7, 0.6)  # absorption where it is thin, and what is below shines through
 
@@ -84,7 +86,9 @@ class Flap:
     """Flaps of dura that are turned over, unevenly, and show their inner face up to a crease [mm]."""
 
     count: tuple[int, int] = (2, 5)
-    width: tuple[float, float] = 1.2, 4.2  # of the inner face in a flap's middle
+    corners: tuple[int, int] = (11, 19)  # between straight cuts of the scissors
+    cut: tuple[float, float] = 0.4, 2.6  # what they leave at a corner
+    width: tuple[float, float] = 0.8, 3.2  # of the inner face in a flap's middle
     beyond: float = 1.6  # by how much the dura ends beyond the crease, at most
     long: tuple[float, float] = 0.35, 1.0  # rad, half of a flap's length
     ragged: float = 0.12  # spread of the dura's end, as cut by hand
@@ -242,18 +246,20 @@ def build(
 
 def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Floats, Floats]:
     """Ends (A,), (A,) mm beyond the edge, of the inner face and of the dura, whose cut is uneven."""
-    crease = _uneven(rng, angle, 0.5, 0.25)
+    crease = _uneven(rng, angle, 0.3, 0.25)
     for middle in rng.uniform(0, 2 * np.pi, rng.integers(*Flap.count)):
         long, wide = rng.uniform(*Flap.long), rng.uniform(*Flap.width)
         aside = _aside(angle, middle + rng.uniform(-0.3, 0.3) * np.cos(angle - middle))
         crease = np.maximum(crease, wide * np.clip(1.3 * (1 - (aside / long) ** 2), 0, 1) ** 0.7)
-    pulled = over(np.full_like(dura, float(dura.mean())), dura, _uneven(rng, angle, 0.5, 0.35))
+    corners = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(*Flap.corners)))
+    cut = np.interp(angle, corners, rng.uniform(*Flap.cut, len(corners)), period=2 * np.pi)
+    pulled = over(cut, dura, 0.5 * ridge(dura, 1.2, at=float(dura.max())))
     ragged = sum(
         rng.normal(0, Flap.ragged / (order / 14) ** 0.8) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
         for order in range(9, 60)
     )
     end = np.maximum(
-        pulled, crease + rng.uniform(0.3, 1) * Flap.beyond * np.abs(_uneven(rng, angle, 0.5, 0.5))
+        pulled, crease + rng.uniform(0.3, 1) * Flap.beyond * np.abs(_uneven(rng, angle, 0.4, 0.5))
     )
     return crease, np.maximum(end + 0.5 * ragged, crease + 0.15)
 
@@ -281,7 +287,7 @@ def paint(rim: Rim, appearance: Appearance, pixels: int, seen: Mask | None = Non
         partial(_paint_rows, rim, appearance, streaks), where, (0.2, 0.0, 0.5), *maps
     )
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    return Coat(colour, normals(noise.blur(bumps, 0.11, extent), extent), dry)
+    return Coat(colour, normals(noise.blur(bumps, 0.07, extent), extent), dry)
 
 
 def _fine(rng: np.random.Generator, pixels: int, extent_mm: float) -> Map:
@@ -378,16 +384,19 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     gutter = outer * (1 - step(past / 1.5 + 0.3 * mottle))
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
     aside = _aside(angle, rim.stitches.astype(np.float32)[stitch])
-    folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
+    folds = (_folds(np.abs(aside) * (mean + away), away, mottle) + _taut(streaks, angle, away, mean)) * (
+        1 - outer
+    )
     start = _round(rim.crease, angle)
     crease = away - start - 0.12 * mottle
     inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
     turned = np.clip(start - 0.5, 0, 1)
     # Blood knows no crease: it thins over a millimetre.
     clean = step((0.35 * fibres + 0.25 * mottle - crease) / 1.6)
-    stained, far = Dura.stained
+    stained, clean_part = Dura.stained
     uneven = 0.8 * wide + 0.35 * mottle + 0.3 * fibres + 0.1 * outer - 0.7 * clean
-    soaked = _soaked(appearance.blood, uneven + stained * (np.clip(away / far, 0, 1.5) - 0.35))
+    part = np.clip(away / np.maximum(reach, 0.3), 0, 1.4) + 0.12 * mottle
+    soaked = _soaked(appearance.blood, uneven + stained * (part - clean_part))
     deepest, level = Blood.pool
     ragged = 0.12 * mottle + 0.1 * fibres + 0.04 * grain
     full = spilt + ragged + level * (3 * appearance.blood - 3.1) - 0.8 * clean
@@ -429,13 +438,13 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     )
     wet = np.maximum(pool, drops) * (1 - tight)
     rough = 0.008 * grain + 0.0015 * fine + outer * (0.0015 * fine + relief)
-    bumps = (folds + over(0.016 * mottle + 0.014 * fibres, 0.025 * mottle, outer) + rough) * (1 - 0.75 * wet)
+    bumps = (folds + over(0.005 * mottle + 0.008 * fibres, 0.025 * mottle, outer) + rough) * (1 - 0.75 * wet)
     bumps = bumps + 0.06 * wet
     bumps = bumps + Flap.height * turned * (
         step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
     )
     dry = np.clip(
-        0.5 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * tight - 0.9 * wet - 0.3 * inner,
+        0.3 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * tight - 0.9 * wet - 0.3 * inner,
         0.02,
         1,
     )
@@ -462,6 +471,15 @@ def _folds(aside: Map, away: Map, mottle: Map) -> Map:
     high, waves, reach = Dura.folds
     wave = np.cos(2 * np.pi / waves * aside + 0.8 * mottle)
     return np.asarray(high * wave * ridge(aside, reach) * np.clip(away / 0.8, 0, 1), np.float32)
+
+
+def _taut(streaks: Map, angle: Map, away: Map, radius: float) -> Map:
+    """Height (r, n) mm of creases along the edge, by noise (512, 512) stretched in that direction."""
+    high, waves = Dura.taut
+    u = (angle * (radius * waves * 2.4) % 512).astype(np.float32)
+    v = (np.clip(away, 0, None) * waves * 24 % 512).astype(np.float32)
+    noisy = cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(high * noisy * np.clip(away / 0.3, 0, 1), np.float32)
 
 
 def _soaked(level: float, uneven: Map) -> Map:

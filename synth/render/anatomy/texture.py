@@ -71,9 +71,9 @@ class Bleeding:
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
-    absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
+    absorption_per_mm: Rgb = (0.2, 4.4, 6.5)
     opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.74, 0.16, 0.085)  # albedo
+    wall: Rgb = (0.86, 0.22, 0.11)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
@@ -90,7 +90,7 @@ class Vein:
     margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
     crest: float = 0.5  # of a thick one's radius: width of its bluish crest
     rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
-    rim_dark: Rgb = (1.1, 1.5, 1.15)  # absorption
+    rim_dark: Rgb = (0.8, 1.15, 0.85)  # absorption
     mottle: float = 0.14  # standard deviation of its wall's albedo, as a share of it
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
@@ -107,13 +107,13 @@ class Film:
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
-    reach_mm: tuple[float, float] = 0.22, 0.5  # where it ends, of the finest vessels and of wide ones
+    reach_mm: tuple[float, float] = 0.12, 0.45  # where it ends, of the finest vessels and of wide ones
     swell_mm: float = 0.004  # standard deviation of the undulation
-    rough: float = 0.08  # standard deviation of slopes where the film is thin
+    rough: float = 0.05  # standard deviation of slopes where the film is thin
     level: float = 0.15  # share of the pia's slope that a pool takes away,
     filled: float = 0.6  # and of the relief under it
-    ripples: float = 0.042  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
-    ripples_mm: float = 0.3  # blur that makes them
+    ripples: float = 0.065  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
+    ripples_mm: float = 0.19  # blur that makes them
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
@@ -218,7 +218,7 @@ def _parenchyma(
     perfused, gyrus = (np.asarray(tint, np.float32) for tint in tints)
     albedo = over(perfused, gyrus, pale)
     albedo = albedo * (1 + appearance.grain * grain[..., None] * np.array(Parenchyma.grain, np.float32))
-    blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * around
+    blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.2 + 1.1 * sulci) * around
     blood = blood * np.clip(1 + 0.3 * mottle, 0.2, 2) + appearance.subpial_absorbance_per_mm * deep
     return through(albedo, blood, Parenchyma.pia)
 
@@ -348,8 +348,8 @@ def _film(
         relief = (
             relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
         )
-    thin = 3.8 + 1.5 * uneven - 3 * wet
-    dry = np.clip(thin, 0.05, 1.0)
+    thin = 3.0 + 1.5 * uneven - 3 * wet
+    dry = np.clip(thin, 0.05, 0.85)
     pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)
     dry = np.minimum(dry, 1 - pools)
     swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.2 * pools)
@@ -367,7 +367,7 @@ def _film(
     wide = on_vein * np.clip((radius - start) / span, 0, 1)
     height = height + wide * _waves(tile, Vein.waves, Vein.waves_mm, extent, len(sulci))
     ripples = _waves(tile.T, Film.ripples, Film.ripples_mm, extent, len(sulci))
-    height = height + pooled * (1 - on_vein) * ripples
+    height = height + (0.55 + 0.45 * pooled) * (1 - on_vein) * ripples
     bare, wide = (
         cv2.resize(share, (coarse, coarse), interpolation=cv2.INTER_AREA) for share in (on_vein, wide)
     )

@@ -44,6 +44,8 @@ def _draw(
                 part = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / whole))
                 aside, along = x - x0 - part * dx, y - y0 - part * dy
                 own = first + part * (last - first)
-                away = np.sqrt(aside * aside + along * along) / scale
-                if away - own < margin and own - away > radius[y, x] - distance[y, x]:
-                    distance[y, x], radius[y, x] = away, own
+                # Nearer than its margin, and deeper than in the vessel before: most texels need no root.
+                most = scale * (own + min(margin, distance[y, x] - radius[y, x]))
+                square = aside * aside + along * along
+                if most > 0 and square < most * most:
+                    distance[y, x], radius[y, x] = np.sqrt(square) / scale, own

@@ -73,22 +73,24 @@ TRIBUTARIES = (
     Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=3.0, reach=12.0, near=1.3, step=0.18, straight=1.6, end=(0.06, 0.08)),
-    Growth(spacing=1.7, reach=6.0, near=0.65, step=0.14, straight=1.6, end=(0.045, 0.058)),
-    Growth(spacing=1.0, reach=4.0, near=0.36, step=0.12, straight=1.6, end=(0.034, 0.044)),
-    Growth(spacing=0.55, reach=2.0, near=0.2, step=0.1, straight=1.4, end=(0.025, 0.031)),
+    Growth(spacing=2.4, reach=10.0, near=0.9, step=0.18, straight=1.4, end=(0.066, 0.088)),
+    Growth(spacing=1.05, reach=4.0, near=0.33, step=0.14, straight=1.3, end=(0.05, 0.062)),
+    Growth(spacing=0.62, reach=2.5, near=0.17, step=0.12, straight=1.2, end=(0.036, 0.047)),
+    Growth(spacing=0.45, reach=1.5, near=0.15, step=0.1, straight=1.1, end=(0.026, 0.033)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.22  # radius of such a vein
-_TWIG_MM = 0.65  # shorter side branches are left out: they look like thorns
-_ROUNDED = 24  # rounds of smoothing of what has grown in, over some 0.3 mm
+_TWIG_MM = 0.25  # shorter side branches are left out: they look like thorns
+_ROUNDED = 10  # rounds of smoothing of what has grown in, over some 0.2 mm
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
-_TAPER_MM = 0.9  # length over which arterioles and tributaries thin
-_POINTED = 0.010, 0.009  # radius of a free end, and by how much it grows with each mm from there
-_WIDENS = 1.03  # times, at most and besides, from a node to the next one up
-_WINDING = 0.13, 1.6  # shift of fine vessels, and over what distance
+_TAPER_MM = 0.5  # length over which arterioles and tributaries thin
+_POINTED = 0.026, 0.06  # radius of a free end, and by how much it grows with each mm from there
+_ENDS_MM, _ENDS = (0.0, 0.55, 1.1, 1.8), (0.018, 0.028, 0.056, 0.2)  # most radius before a free end
+_WIDENS = 1.08  # times, at most and besides, from a node to the next one up
+_WINDING = 0.18, 1.3  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
+_WIDEST_MM = 0.5  # radius that no artery of the pia reaches, whatever its branches sum up to
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
 
 
@@ -124,7 +126,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     arteries = main = _slender(_smooth(_even(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm)), 1.3))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
-    arteries = _finished(_without_thorns(arteries), len(main.nodes), _BENT[0], extent_mm, rng)
+    arteries = _finished(_narrow(_without_thorns(arteries)), len(main.nodes), _BENT[0], extent_mm, rng)
     return Vessels(veins, trunks, visible, arteries, deep)
 
 
@@ -178,6 +180,11 @@ def _slender(tree: Tree) -> Tree:
     return Tree(tree.nodes, tree.parent, tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5)
 
 
+def _narrow(tree: Tree) -> Tree:
+    """The tree with the widest vessels of a radius near to `_WIDEST_MM`."""
+    return Tree(tree.nodes, tree.parent, tree.radius / (1 + (tree.radius / _WIDEST_MM) ** 4) ** 0.25)
+
+
 def _without_thorns(tree: Tree) -> Tree:
     """The tree without side branches shorter than `_TWIG_MM`."""
     left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
@@ -206,7 +213,7 @@ def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.rand
     )
     supple = shift / (1 + (tree.radius / _SUPPLE_MM) ** 2)
     left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
-    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
+    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.5, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
     short, long = (
         noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 9.0)
@@ -228,7 +235,8 @@ def _pointed(tree: Tree, extent_mm: float) -> Tree:
         wide[k] = min(wide[k], limit[k])
         if up >= 0:
             limit[up] = max(limit[up], _WIDENS * wide[k] + slope * float(length[k]))
-    radius, trunk = np.array(wide), _trunk_of(tree)
+    left = remaining(tree.nodes, tree.parent, np.where(inside, 0.0, _ENDS_MM[-1]))
+    radius, trunk = np.minimum(wide, np.interp(left, _ENDS_MM, _ENDS, right=np.inf)), _trunk_of(tree)
     for root in np.flatnonzero((tree.parent < 0) & inside):
         away = np.hypot(*(tree.nodes - tree.nodes[root]).T)
         radius = np.where(trunk == root, np.minimum(radius, end + slope * away), radius)

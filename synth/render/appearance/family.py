@@ -48,9 +48,9 @@ class Ranges:
     """
 
     gyrus_albedo: Colour = (0.95, 0.765, 0.49)
-    perfused_albedo: Colour = (0.93, 0.57, 0.38)
-    vein_crest_albedo: Colour = (0.27, 0.235, 0.3)
-    vein_side_albedo: Colour = (0.17, 0.045, 0.055)
+    perfused_albedo: Colour = (0.95, 0.61, 0.41)
+    vein_crest_albedo: Colour = (0.31, 0.27, 0.345)
+    vein_side_albedo: Colour = (0.23, 0.07, 0.085)
     arterial_absorption: Ends = (1.1, 1.5)
     subpial_absorbance_per_mm: Ends = (1.4, 2.2)
     pial_absorbance: Ends = (0.3, 0.9)
@@ -58,8 +58,8 @@ class Ranges:
     grain: Ends = (0.008, 0.02)
     fluid_smoothing_mm: Ends = (0.035, 0.06)
     bump: Ends = (0.8, 1.3)
-    roughness: Ends = (0.028, 0.04)
-    dry_roughness: Ends = (0.11, 0.16)
+    roughness: Ends = (0.018, 0.026)
+    dry_roughness: Ends = (0.2, 0.28)
     blood: Ends = (0.25, 0.75)
     dura_albedo: Colour = (0.86, 0.6, 0.5)
     surroundings_albedo: Colour = (0.40, 0.10, 0.065)

@@ -16,7 +16,9 @@ from synth.render.materials import Lamp
 
 _APART = 2.2  # between the lamps, round the optical axis [rad]
 _STEEPEST_DEG = 6.5
-_FADE = 0.6  # widths of the field over which the spot fades
+_EDGE = 2**-0.25  # radius of the spot that is called its own, as a share of that of half its light
+_OPENING = 0.37  # radius of a usual opening in widths of the field, whose mean light no spot changes
+_BRIGHTEST = 1.25  # in the middle of a spot far smaller than it
 _RAYS = 65  # across a picture
 _LOWEST = 0.17  # height of any lamp over the opening's plane, as a share of its distance
 _WINDOW_DEG = 0.7  # angular radius of a lamp's window at the tissue
@@ -44,7 +46,7 @@ class Lighting:
     main: float  # share of the light that comes from the main lamp
     power: float
     kelvin: float  # colour temperature
-    even: float  # radius of the even spot, in widths of the field
+    even: float  # radius of the spot, in widths of the field: light falls by a third to there
     drift: float  # largest change of power over the sequence
     phase: float  # of the drift's slow wave in the rest frame [rad]
     ambient: float = 0.05  # share of the lamps' light that comes from all directions
@@ -83,20 +85,29 @@ def mirror_slopes(camera: Camera, lamp: Lamp) -> tuple[float, float, float]:
 
 
 def spot(camera: Camera, rest: Camera, even: float) -> Map:
-    """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening: even within
-    `even` widths of the field, fading outside; fixed to the microscope's pose `rest`."""
+    """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening, which falls by
+    a third to `even` widths of the field and on outside; fixed to the microscope's pose `rest`.
+
+    The image of a lamp's field stop, out of focus: 1 / (1 + (r / h)^4), brighter than 1 in the middle, since
+    its mean over a usual opening is 1. Infinite `even`: 1 everywhere.
+    """
+    width, height = camera.size
+    if np.isinf(even):
+        return np.ones((height, width), np.float32)
     field = rest.size[0] * rest.mm_per_px
     axis = rest.centre / np.linalg.norm(rest.centre)
-    width, height = camera.size
     # A smooth field: a coarse grid of rays is enough.
     columns, rows = (np.linspace(0, n - 1, _RAYS) for n in (width, height))
     x, y = np.meshgrid((columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.rotation
     met = camera.centre - (camera.centre @ axis / (rays @ axis))[..., None] * rays
-    away = (np.linalg.norm(met, axis=-1) / field).astype(np.float32)
+    half = even / _EDGE
+    share = 1 / (1 + (np.linalg.norm(met, axis=-1) / (field * half)) ** 4)
+    inner = (_OPENING / half) ** 2
+    share *= min(inner / np.arctan(inner), _BRIGHTEST)
     across, down = (np.linspace(0, _RAYS - 1, n, dtype=np.float32) for n in (width, height))
-    away = cv2.remap(away, *np.meshgrid(across, down), cv2.INTER_LINEAR)
-    return np.asarray(np.clip((even + _FADE - away) / _FADE, 0, 1), np.float32)
+    share = cv2.remap(share.astype(np.float32), *np.meshgrid(across, down), cv2.INTER_LINEAR)
+    return np.asarray(share, np.float32)
 
 
 def _leaning(camera: Camera, lean: float, turn: float) -> Floats:

@@ -15,8 +15,9 @@ import numpy.typing as npt
 from synth.arrays import Floats, Map
 from synth.errors import UserError
 from synth.render.camera import camera_calibration
+from synth.system.jit import argument_types, inlined, vectorised
 
-_NEWTON = 20
+_NEWTON, _ROUNDING = 20, 1e-14
 _BORDER = 65  # points on a side of the picture
 
 
@@ -231,51 +232,71 @@ def pixel_grid(size: tuple[int, int]) -> Floats:
 
 def undistort(flat: Floats, distortion: Floats) -> Floats:
     """Inverse of Brown-Conrady on normalised coordinates (N, 2), by Newton's method to rounding."""
-    guess = flat.copy()
-    for _ in range(_NEWTON):
-        error = _distort(guess, distortion) - flat
-        if not error.size or np.abs(error).max() < 1e-14:
-            return guess
-        a, b, d = _slope(guess, distortion)
-        determinant = a * d - b * b
-        step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], 1)
-        guess = guess - step / determinant[:, None]
-    if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
-        raise UserError("render.distortion: folds the picture over itself (or the calibration's does)")
-    return guess
+    if not distortion.any():
+        return flat.copy()
+    found = np.empty(flat.shape)
+    if _undistort(np.ascontiguousarray(flat), _eight(distortion), found):
+        return found
+    raise UserError("render.distortion: folds the picture over itself (or the calibration's does)")
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:
     if not distortion.any():
         return flat
-    x, y = flat[:, 0], flat[:, 1]
+    found = np.empty(flat.shape)
+    _distort_all(np.ascontiguousarray(flat), _eight(distortion), found)
+    return found
+
+
+def _eight(distortion: Floats) -> Floats:
+    """All coefficients (8,), those of the rational model 0 if they are not given."""
+    return np.concatenate([distortion, np.zeros(8 - len(distortion))])
+
+
+@inlined
+def _bend(x: float, y: float, k: Floats) -> tuple[float, float]:
+    """A point as distorted by coefficients (8,)."""
     r2 = x * x + y * y
-    (p1, p2), (radial, _) = distortion[2:4], _radial(r2, distortion)
-    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    down = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    return np.stack([across, down], axis=1)
+    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    radial /= 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    across = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
+    down = y * radial + 2 * k[3] * x * y + k[2] * (r2 + 2 * y * y)
+    return across, down
 
 
-def _radial(r2: Floats, distortion: Floats) -> tuple[Floats, Floats]:
-    """Radial factor at squared radii, and twice its derivative by them."""
-    k1, k2, _, _, k3, *below = distortion
-    top, rise = _cubic(r2, k1, k2, k3)
-    if not below:
-        return top, 2 * rise
-    bottom, fall = _cubic(r2, *below)
-    return top / bottom, 2 * (rise - top / bottom * fall) / bottom
+@argument_types("f8[:,::1], f8[::1], f8[:,::1]")
+@vectorised
+def _distort_all(flat: Floats, k: Floats, found: Floats) -> None:
+    for n in range(len(flat)):
+        found[n, 0], found[n, 1] = _bend(flat[n, 0], flat[n, 1], k)
 
 
-def _cubic(r2: Floats, a: float, b: float, c: float) -> tuple[Floats, Floats]:
-    """1 + a r2 + b r2^2 + c r2^3, and its derivative."""
-    return 1 + r2 * (a + r2 * (b + r2 * c)), a + r2 * (2 * b + 3 * c * r2)
-
-
-def _slope(flat: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats]:
-    """Jacobian of the distortion, which is symmetric: (0, 0), (0, 1) and (1, 1)."""
-    x, y = flat[:, 0], flat[:, 1]
-    r2 = x * x + y * y
-    (p1, p2), (radial, growth) = distortion[2:4], _radial(r2, distortion)
-    cross = growth * x * y + 2 * p1 * x + 2 * p2 * y
-    across = radial + growth * x * x + 2 * p1 * y + 6 * p2 * x
-    return across, cross, radial + growth * y * y + 2 * p2 * x + 6 * p1 * y
+@argument_types("f8[:,::1], f8[::1], f8[:,::1]")
+@vectorised
+def _undistort(flat: Floats, k: Floats, found: Floats) -> bool:
+    """Whether all points (N, 2) were found."""
+    good = True
+    for n in range(len(flat)):
+        x, y = flat[n, 0], flat[n, 1]
+        for _ in range(_NEWTON):
+            u, v = _bend(x, y, k)
+            u, v = u - flat[n, 0], v - flat[n, 1]
+            if abs(u) < _ROUNDING and abs(v) < _ROUNDING:
+                break
+            # The Jacobian, which is symmetric.
+            r2 = x * x + y * y
+            top, bottom = (
+                (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))),
+                (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))),
+            )
+            rise, fall = k[0] + r2 * (2 * k[1] + 3 * k[4] * r2), k[5] + r2 * (2 * k[6] + 3 * k[7] * r2)
+            radial, growth = top / bottom, 2 * (rise - top / bottom * fall) / bottom
+            b = growth * x * y + 2 * k[2] * x + 2 * k[3] * y
+            a = radial + growth * x * x + 2 * k[2] * y + 6 * k[3] * x
+            d = radial + growth * y * y + 2 * k[3] * x + 6 * k[2] * y
+            whole = a * d - b * b
+            x, y = x - (d * u - b * v) / whole, y - (a * v - b * u) / whole
+        u, v = _bend(x, y, k)
+        good &= abs(u - flat[n, 0]) < 1e-9 and abs(v - flat[n, 1]) < 1e-9  # not if they are NaN
+        found[n, 0], found[n, 1] = x, y
+    return good

@@ -65,7 +65,7 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
         scattered = weight * si.bsdf(ray).eval(mi.BSDFContext(), si, si.to_local(lamp.d), hit)
         # Lamps are small, so shadow rays of neighbours are as coherent as the paths: 8% of the whole trace.
         shadow = hit & scene.ray_test(si.spawn_ray_to(lamp.p), True, hit)
-        # Where a fine part of an object is hit edge-on, its own light or reflection may be undefined.
+        # Light of a face too thin for single precision, as meshes of one's own may have, is undefined.
         emitted, scattered = (
             dr.select(dr.isfinite(light), light, 0) for light in (si.emitter(scene).eval(si), scattered)
         )

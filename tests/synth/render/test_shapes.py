@@ -325,3 +325,16 @@ def test_a_bent_bar_faces_outwards_along_its_path(sides: int) -> None:
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     section = 0.3**2 * sides / 2 * np.sin(2 * np.pi / sides)
     assert 0.75 * section * length < made.volume < 1.05 * section * length
+
+
+@pytest.mark.parametrize("kind", [*instrument.SHAPES, "clip"])
+def test_no_face_of_a_drawn_part_lacks_an_area(kind: str) -> None:
+    if kind == "clip":  # its ends are closed by two rings in one place
+        s, radius = np.array([0.0, 0.0, 0.3, 2.9, 3.2, 3.2]), np.array([0.02, 1.0, 1.0, 1.0, 1.0, 0.02])
+        part = instrument.Part(instrument.sweep(s, radius, radius, 0 * s, 0.8), 0)
+        path = np.column_stack([s, 0 * s, 0.1 * s])
+        shapes = [scenery.Bar(part, 16, path, finish.Finish((0.6, 0.6, 0.6), 0.2), kind).shape]
+    else:
+        shapes = [part.shape for half in (0.3, 4.0) for part in instrument.shape_of(kind, half)[0]]
+    for shape in shapes:
+        assert trimesh.triangles.area(shape.vertices[shape.faces]).min() > 1e-5
