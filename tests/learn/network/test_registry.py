@@ -23,9 +23,11 @@ from learn.settings import TrainingSettings, change_preset, preset
 from learn.split import Split
 from learn.training.train import train
 from synth.errors import Caution, UserError
+from synth.job.types import MembraneState
 from synth.system.config_file import override
 
 TOLERANCE = 1e-4  # of the largest output
+STATES: dict[int, MembraneState] = {-1: "stripped", 0: "unknown", 1: "intact"}
 
 
 def by_pytorch(folder: Path, inputs: list[Tensor]) -> np.ndarray:
@@ -36,7 +38,15 @@ def by_pytorch(folder: Path, inputs: list[Tensor]) -> np.ndarray:
 
 def by_onnx(predictor: Predictor, inputs: list[Tensor]) -> np.ndarray:
     named = dict(zip(input_names(predictor.card), (each.numpy() for each in inputs), strict=True))
-    return predictor.density(named["displacement"], named["mask"][0, 0], 1.0, named.get("confidence"))
+    states = [STATES[int(k)] for k in named.get("membrane", np.zeros(len(named["displacement"])))]
+
+    def run(k: slice, state: MembraneState) -> np.ndarray:
+        sure = named["confidence"][k] if "confidence" in named else None
+        return predictor.density(named["displacement"][k], named["mask"][0, 0], 1.0, sure, state)
+
+    if len(set(states)) == 1:
+        return run(slice(None), states[0])
+    return np.concatenate([run(slice(k, k + 1), state) for k, state in enumerate(states)])
 
 
 def assert_equal(got: np.ndarray, expected: np.ndarray) -> None:
