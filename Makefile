@@ -103,10 +103,10 @@ FORCES := arch.levels=3 arch.dropout=0 arch.relative=true arch.confidence=true a
 	  batch=16 learning_rate=1.5e-3 frames=0 epoch_frames=4000 --also $(WEIGHTS)/bench
 weights: setup
 	$(BIN)/python -m weights make $(WEIGHTS)
-	$(BIN)/synth render mission -o $(WEIGHTS)/mission sequences=93 seed=56
+	$(BIN)/synth render mission -o $(WEIGHTS)/mission sequences=200 seed=56
 	$(BIN)/synth render mission -o $(WEIGHTS)/one-camera sequences=375 render.stereo_mm=0 "store.without=[]"
-	$(BIN)/synth render weights/mission-bench.yaml -o $(WEIGHTS)/bench sequences=110
-	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo epochs=45 surface_motion_mm=0.7 -o $(WEIGHTS)/made/stereo
+	$(BIN)/synth render weights/mission-bench.yaml -o $(WEIGHTS)/bench sequences=200
+	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo epochs=60 surface_motion_mm=0.7 -o $(WEIGHTS)/made/stereo
 	$(BIN)/learn train $(WEIGHTS)/one-camera $(FORCES) --preset cpu --input mixed epochs=50 surface_motion_mm=0 -o $(WEIGHTS)/made/mono
 
 evidence: setup
