@@ -327,29 +327,7 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
 def page(found: Mapping[str, Any]) -> report.Page:
     """The curve of the trainings, errors by place, and the tables."""
     kinds = [kind for kind in KINDS if kind in found["errors"]]
-    words = []
-    for place, name in PLACES.items():
-        at_place = found["places"][place]
-        opened, closes = at_place["opened"], at_place["closed"]
-        words.append(
-            f"- *{name.capitalize()}*: on recovered flow the network trained on ideal flow errs {opened:.2g} "
-            "times as much as on ideal flow"
-        )
-        if closes["R"]["undefined"]:
-            words[-1] += "; there is no gap to close."
-            continue
-        words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap"
-        if "S" in kinds:
-            words[-1] += f", the control {_closed(closes['S'])}"
-        if "N" in kinds:
-            low, high = (100 * end for end in at_place["noise_less_real"][1:])
-            words[-1] += (
-                f", with fitted noise {_closed(closes['N'])} (its error less that after recovered flow: "
-                f"{low:.2g} to {high:.2g} percentage points)"
-            )
-        words[-1] += "."
-        if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
-            words[-1] += " There its error is not below that of no force: nothing follows from these shares."
+    words = _answer(found, kinds)
     tables = []
     for heading, errors, factor in (
         ("Errors as shares of the mean force", found["errors"], 100.0),
@@ -389,6 +367,34 @@ def page(found: Mapping[str, Any]) -> report.Page:
         [report.Section("Share of the gap closed", shares), *tables],
         report.chart(partial(_draw_curve, curve=found["curve"]), width=720),
     )
+
+
+def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
+    """Of each place, by how much the gap opens, and what closes it."""
+    words = []
+    for place, name in PLACES.items():
+        at_place = found["places"][place]
+        opened, closes = at_place["opened"], at_place["closed"]
+        words.append(
+            f"- *{name.capitalize()}*: on recovered flow the network trained on ideal flow errs {opened:.2g} "
+            "times as much as on ideal flow"
+        )
+        if closes["R"]["undefined"]:
+            words[-1] += "; there is no gap to close."
+            continue
+        words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap"
+        if "S" in kinds:
+            words[-1] += f", the control {_closed(closes['S'])}"
+        if "N" in kinds:
+            low, high = (100 * end for end in at_place["noise_less_real"][1:])
+            words[-1] += (
+                f", with fitted noise {_closed(closes['N'])} (its error less that after recovered flow: "
+                f"{low:.2g} to {high:.2g} percentage points)"
+            )
+        words[-1] += "."
+        if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
+            words[-1] += " There its error is not below that of no force: nothing follows from these shares."
+    return words
 
 
 def _draw_curve(axes: Axes, curve: Mapping[str, Sequence[Sequence[float]]]) -> None:

@@ -100,8 +100,8 @@ class Fusion:
             np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
         )
         spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
-        leading = np.array([estimate.size_mn for estimate in fused])
-        self.video = VideoEstimates(leading, by_network, by_physics, spread, motion_mm, cameras, stated)
+        sizes = np.array([estimate.size_mn for estimate in fused])
+        self.video = VideoEstimates(sizes, by_network, by_physics, spread, motion_mm, cameras, stated)
         self._reason = table.find_reason(self.video, network, scene.recovered_by)
         if self._reason:
             return list(fused)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import ndtri, softmax
@@ -29,10 +29,19 @@ class ForceMixture:
         """(3,)."""
         return np.asarray(self.weight @ self.force, np.float64)
 
+    @cached_property
+    def draws(self) -> Floats:
+        """Forces (N, 3) of the distribution, always the same."""
+        weight = self.weight / self.weight.sum()
+        # The sum may round to less than the last draw's place.
+        drawn = np.searchsorted(np.cumsum(weight)[:-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
+        root = np.linalg.cholesky(self.covariance + 1e-12 * np.eye(3))
+        return np.asarray(self.force[drawn] + np.einsum("nab,nb->na", root[drawn], _normals()[0]))
+
     @property
     def mean_size(self) -> float:
-        """Mean of the magnitude, by reproducible draws."""
-        return float(np.linalg.norm(_draw(self), axis=1).mean())
+        """Mean of the magnitude, by the draws."""
+        return float(np.linalg.norm(self.draws, axis=1).mean())
 
     def find_size(self, cameras: int) -> float:
         """The estimate of the magnitude: with one camera its mean, as force along the line of sight does not
@@ -95,22 +104,13 @@ def size_interval(force: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
         size = force.find_size(cameras)
         ends = [size_interval(force.within(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
-    size, forces = force.find_size(cameras), _draw(force)
+    size, forces = force.find_size(cameras), force.draws
     sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * _normals()[1])
     spread = np.cov(forces.T) + 1e-12 * np.eye(3)
     if force.mean @ np.linalg.solve(spread, force.mean) < _SURELY:
         return 0.0, max(float(np.quantile(sizes, 0.9 if cameras == 2 else 0.98)), size)
     low, high = np.quantile(sizes, (0.05, 0.95))
     return min(float(low), size), max(float(high), size)
-
-
-def _draw(force: ForceMixture) -> Floats:
-    """Forces (N, 3) of a distribution, the same at every call."""
-    weight = force.weight / force.weight.sum()
-    # The sum may round to less than the last draw's place.
-    drawn = np.searchsorted(np.cumsum(weight)[:-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
-    root = np.linalg.cholesky(force.covariance + 1e-12 * np.eye(3))
-    return np.asarray(force.force[drawn] + np.einsum("nab,nb->na", root[drawn], _normals()[0]))
 
 
 @lru_cache(maxsize=1)

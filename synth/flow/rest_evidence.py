@@ -68,10 +68,10 @@ def align(frame: Pixels, rest: Pixels, instrument: Map) -> tuple[Pixels, Map]:
     side = Limits.across_px
     smooth = cv2.blur(np.dstack([cv2.medianBlur(plane, side) for plane in cv2.split(back)]), (side, side))
     columns, rows = image.ends(smooth)
-    how = cv2.INTER_LINEAR
+    mode = cv2.INTER_LINEAR
     return (
-        np.asarray(cv2.remap(rest, columns, rows, how, borderMode=cv2.BORDER_REPLICATE), np.uint8),
-        np.asarray(cv2.remap(instrument, columns, rows, how, borderMode=cv2.BORDER_REPLICATE), np.float32),
+        np.asarray(cv2.remap(rest, columns, rows, mode, borderMode=cv2.BORDER_REPLICATE), np.uint8),
+        np.asarray(cv2.remap(instrument, columns, rows, mode, borderMode=cv2.BORDER_REPLICATE), np.float32),
     )
 
 

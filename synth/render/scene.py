@@ -319,14 +319,13 @@ class Renderer:
         return [np.asarray(np.mean(taken, axis=0), np.float32) for taken in zip(*shots, strict=True)]
 
     def _spot(self, camera: Camera) -> Map:
-        return self._spot_at_rest if camera is self.camera else self._spot_of(camera)
+        if camera is self.camera:
+            return self._spot_at_rest
+        return light.spot(camera, self.camera, self.content.spot)
 
     @cached_property
     def _spot_at_rest(self) -> Map:
-        return self._spot_of(self.camera)
-
-    def _spot_of(self, camera: Camera) -> Map:
-        return light.spot(camera, self.camera, self.content.spot)
+        return light.spot(self.camera, self.camera, self.content.spot)
 
     def _metal(self, posed: Shape) -> tuple[Shape, Floats]:
         """All metal as one mesh, instruments first, and the surroundings (V, 3) that it mirrors."""

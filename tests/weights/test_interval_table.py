@@ -26,7 +26,7 @@ def draw(make: int, number: int) -> Example:
     )
     parts = both[..., None] * way
     spread = apart * curve + 0.02 * curve.max()
-    video = VideoEstimates(np.abs(both).mean(axis=0), *parts, spread, 0.02 * curve, 2, float(number % 2))
+    video = VideoEstimates(np.abs(both.mean(axis=0)), *parts, spread, 0.02 * curve, 2, float(number % 2))
     return Example(f"make {make}", str(number), video, curve)
 
 

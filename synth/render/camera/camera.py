@@ -254,11 +254,19 @@ def _eight(distortion: Floats) -> Floats:
 
 
 @inlined
+def _stretch(r2: float, k: Floats) -> tuple[float, float]:
+    """The radial factor at a squared radius, and twice its derivative by it; coefficients (8,)."""
+    top = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    bottom = 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    rise, fall = k[0] + r2 * (2 * k[1] + 3 * k[4] * r2), k[5] + r2 * (2 * k[6] + 3 * k[7] * r2)
+    return top / bottom, 2 * (rise - top / bottom * fall) / bottom
+
+
+@inlined
 def _bend(x: float, y: float, k: Floats) -> tuple[float, float]:
     """A point as distorted by coefficients (8,)."""
     r2 = x * x + y * y
-    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-    radial /= 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    radial, _ = _stretch(r2, k)
     across = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
     down = y * radial + 2 * k[3] * x * y + k[2] * (r2 + 2 * y * y)
     return across, down
@@ -285,17 +293,12 @@ def _undistort(flat: Floats, k: Floats, found: Floats) -> bool:
                 break
             # The Jacobian, which is symmetric.
             r2 = x * x + y * y
-            top, bottom = (
-                (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))),
-                (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))),
-            )
-            rise, fall = k[0] + r2 * (2 * k[1] + 3 * k[4] * r2), k[5] + r2 * (2 * k[6] + 3 * k[7] * r2)
-            radial, growth = top / bottom, 2 * (rise - top / bottom * fall) / bottom
+            radial, growth = _stretch(r2, k)
             b = growth * x * y + 2 * k[2] * x + 2 * k[3] * y
             a = radial + growth * x * x + 2 * k[2] * y + 6 * k[3] * x
             d = radial + growth * y * y + 2 * k[3] * x + 6 * k[2] * y
-            whole = a * d - b * b
-            x, y = x - (d * u - b * v) / whole, y - (a * v - b * u) / whole
+            determinant = a * d - b * b
+            x, y = x - (d * u - b * v) / determinant, y - (a * v - b * u) / determinant
         u, v = _bend(x, y, k)
         good &= abs(u - flat[n, 0]) < 1e-9 and abs(v - flat[n, 1]) < 1e-9  # not if they are NaN
         found[n, 0], found[n, 1] = x, y
