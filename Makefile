@@ -6,7 +6,7 @@
 #   make quick   lint, types, and the tests that take seconds
 #   make guard   by how much this checkout's values differ from the stored ones, a minute; ACCEPT=1 stores them
 #   make docs    the pages in site/; open site/index.html
-#   make weights  trains the networks again, from nothing, into runs/weights/made: of motion, then of force; many hours
+#   make weights  trains the networks again, from nothing, into runs/weights/made: of motion, then `stereo`; many hours
 #   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
 #   make clean   removes all of the above
 #
@@ -66,9 +66,9 @@ demo: .venv/installed .venv/checked
 	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
 	@echo && echo "4 of 4: scores it on a video that it was not trained on, as on a recording with a force sensor"
 	rm -rf $(DEMO)/recordings
-	recording=$$($(BIN)/bench from-dataset $(DEMO)/data --unseen-by mono --unseen-by $(DEMO)/model -o $(DEMO)/recordings) && \
+	recording=$$($(BIN)/bench from-dataset $(DEMO)/data --unseen-by $(DEMO)/model -o $(DEMO)/recordings) && \
 	  echo "membrane: stripped  # as in this job" >> $$recording/meta.yaml && \
-	  $(BIN)/bench score $$recording --model mono --also "trained here=$(DEMO)/model" --rate 0 -o $(DEMO) \
+	  $(BIN)/bench score $$recording --also "trained here=$(DEMO)/model" --rate 0 -o $(DEMO) \
 	    --title "Force from video: a sequence unseen in training"
 	@echo && echo "done: open $(DEMO)/report.html"
 
@@ -104,10 +104,8 @@ FORCES := arch.levels=3 arch.dropout=0 arch.relative=true arch.confidence=true a
 weights: setup
 	$(BIN)/python -m weights make $(WEIGHTS)
 	$(BIN)/synth render mission -o $(WEIGHTS)/mission sequences=200 seed=56
-	$(BIN)/synth render mission -o $(WEIGHTS)/one-camera sequences=375 render.stereo_mm=0 "store.without=[]"
 	$(BIN)/synth render weights/mission-bench.yaml -o $(WEIGHTS)/bench sequences=200
 	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo epochs=60 surface_motion_mm=0.7 -o $(WEIGHTS)/made/stereo
-	$(BIN)/learn train $(WEIGHTS)/one-camera $(FORCES) --preset cpu --input mixed epochs=50 surface_motion_mm=0 -o $(WEIGHTS)/made/mono
 
 evidence: setup
 	$(BIN)/python -m evidence all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \

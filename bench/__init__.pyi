@@ -8,3 +8,4 @@ from .recording.from_sequence import export_recording as export_recording
 from .scoring.result import Result as Result
 from .scoring.score import Settings as Settings
 from .scoring.score import score as score
+from .tracking.estimate import estimate as estimate

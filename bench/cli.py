@@ -16,6 +16,7 @@ from typer import Argument, Option
 
 from bench.importers.import_formats import list_endings
 from synth.errors import UserError, as_user_error
+from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
@@ -35,7 +36,9 @@ Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
 Masks = Annotated[str, Option(help="auto, none, or a folder of NNNNNN.png or mask.png.")]
-ModelFolder = Annotated[Path | None, Option("--model", "-m", help="A model's folder, mono or stereo.")]
+ModelFolder = Annotated[
+    Path | None, Option("--model", "-m", help="A model's folder, or stereo. Default: physics.")
+]
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
 
@@ -50,6 +53,9 @@ def score(
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     title: Annotated[str, Option(help="Heading of the report.")] = "",
     also: Annotated[list[str] | None, Option(help="A further model, as NAME=FOLDER.")] = None,
+    main: Annotated[
+        str | None, Option(help="Method that the report is about. Default: the model, else physics.")
+    ] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
     region: Annotated[str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part.")] = "",
@@ -61,11 +67,11 @@ def score(
     """
     from threadpoolctl import threadpool_limits
 
+    from bench.methods.comparison import MAIN, PHYSICS
     from bench.methods.network import Model
     from bench.recording.recording_folder import open_recording
     from bench.scoring import score as scoring
     from bench.scoring.result import as_json
-    from learn.inference.shipped_networks import choose_model
     from learn.training.threads import choose_threads
     from synth.video.mask_files import read_choice
 
@@ -77,8 +83,9 @@ def score(
     threadpool_limits(choose_threads())
     result = scoring.score(
         opened,
-        model or choose_model(opened.has_stereo),
+        model,
         methods={name: Model(Path(at)) for name, at in others.items()},
+        main=main or (MAIN if model else PHYSICS),
         settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),
         out=folder,
         title=title,
@@ -112,6 +119,60 @@ def _print_result(result: Result, folder: Path) -> None:
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
+@app.command(epilog="Example: bench estimate video.mp4 --scale 0.05 --young 1.5")
+def estimate(
+    source: Annotated[Path, Argument(help="Video, PNGs' folder, dataset, store, or .npz of flow.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
+    scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
+    young: Young = None,
+    membrane: Annotated[MembraneState, Option(help="Of the pia.")] = "unknown",
+    living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
+    tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
+    masks: Masks = "auto",
+    input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,
+    flow: Backend = "tvl1",
+    shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
+    rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
+    pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
+    overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
+    json: Json = False,
+) -> None:
+    """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
+
+    Exit code 2 if no frame has a force.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from bench.tracking.estimate import apply_physics, choose_input
+    from learn.inference.prediction_file import predict_files
+    from learn.inference.video_motion import VideoOptions, motions
+    from learn.training.threads import choose_threads
+    from synth.flow.recording.decode import RecordingFlowSettings
+    from synth.video.mask_files import read_choice
+    from synth.video.pixel_scale import read_scale
+
+    kind, files = read_choice(masks)
+    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
+    options = VideoOptions(read_scale(scale), tissue, settings, files)
+    threadpool_limits(choose_threads())
+    given = tissue is not None, files is not None
+    find = partial(apply_physics, young_kpa=young, membrane=membrane, living=living, is_given=given)
+    peaks, notes = dict[str, float | None](), dict[str, list[str]]()
+    for file in predict_files(
+        find, motions(source, choose_input(source, input), options), source, out, overlay
+    ):
+        peaks[file.name], notes[file.name] = file.peak_mn, file.notes
+        if not json:
+            for note in file.notes:
+                typer.echo(f"note: {file.name}: {note}", err=True)
+            what = "no frame has a force" if file.peak_mn is None else f"peak force {file.peak_mn:.3g} mN"
+            typer.echo(f"{file.name}: {file.frames} frames, {what}")
+    if json:
+        print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
+    if all(peak is None for peak in peaks.values()):
+        raise typer.Exit(2)
+
+
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
 def pool(
     scores: Annotated[list[Path], Argument(help="Folders that `bench score` wrote, or their score.json.")],
@@ -132,7 +193,7 @@ def report(
     out: Annotated[Path, Option("--out", "-o", help="Folder for the page, and a report of each.")],
     json: Json = False,
 ) -> None:
-    """Scores several recordings by the pretrained networks: one page, pooled scores, a report of each."""
+    """Scores several recordings by physics: one page, pooled scores, a report of each."""
     from threadpoolctl import threadpool_limits
 
     from bench.scoring.session_report import PAGE, report_recordings
@@ -309,7 +370,7 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
     video: Annotated[Path, Argument(help="Or a camera: its number, or /dev/video0. It begins at rest.")],
-    model: ModelFolder = None,
+    model: Annotated[Path | None, Option("--model", "-m", help="A model's folder, for forces.")] = None,
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; needed with a model.")] = None,
     young: Young = None,
     flow: Backend = "tvl1",
@@ -328,7 +389,6 @@ def live(
     from bench.methods.network import Model
     from bench.tracking import live
     from bench.tracking.capture import Camera, is_camera
-    from learn.inference.shipped_networks import choose_model
     from learn.training.threads import choose_threads
     from synth.flow.estimator import name_motion
     from synth.flow.recording.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
@@ -345,8 +405,6 @@ def live(
         raise UserError(f"--seconds: {video} is no camera")
     drawn = tissue or (None if filmed else video.parent / "tissue.png")
     mask = partial(read_mask, drawn) if drawn and (tissue or drawn.exists()) else None
-    # Without a scale there is no force: flow alone is requested.
-    model = model or (choose_model(stereo=False) if scale else None)
     threadpool_limits(choose_threads())
     method = None if model is None else Model(model)
     for note in [] if method is None else method.predictor.card.doubt(name_motion(flow)):

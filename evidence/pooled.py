@@ -1,15 +1,18 @@
 """Recordings scored by `bench score`, and pooled on a page by `bench pool`."""
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from bench.methods.comparison import PHYSICS
 from bench.scoring import pool
 from evidence import report
 from synth.errors import UserError
 
-PRETRAINED = {1: "mono", 2: "stereo"}  # model by number of cameras
+# Options of `bench score` by number of cameras: with two a pretrained network is scored next to physics.
+_OPTIONS = {1: (), 2: ("--model", "stereo", "--main", PHYSICS)}
 FOLDERS = {1: "monocular", 2: "stereo"}  # of the results, likewise
 _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers, which the page counts
 
@@ -19,13 +22,14 @@ def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
 
     Raises UserError: a command failed, or no recording has valid numbers.
     """
-    model = PRETRAINED[cameras]
+    options = _OPTIONS[cameras]
     scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
     for folder, score in zip(recordings, scores, strict=True):
         if not (score / "score.json").is_file():
-            words = ("score", str(folder), "--model", model, "-o", str(score))
+            words = ("score", str(folder), *options, "-o", str(score))
             code = subprocess.run([sys.executable, "-m", "bench", *words]).returncode
             if code not in (0, _REFUSED):
                 raise UserError(f"bench score: exit code {code}")
-    by = f"{report.command()}\n    bench score RECORDING --model {model}\n    bench pool SCORES"
+    line = shlex.join(["bench", "score", "RECORDING", *options])
+    by = f"{report.command()}\n    {line}\n    bench pool SCORES"
     pool.write(pool.pool(pool.read(scores)), out, by)

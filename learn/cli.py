@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,7 +59,7 @@ def train_command(
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
     labels: Annotated[list[Path] | None, Option(help="A dataset of which only the truth is used.")] = None,
-    start: Annotated[str | None, Option(help="A model to start from: a folder, mono or stereo.")] = None,
+    start: Annotated[str | None, Option(help="A model to start from: a folder, or stereo.")] = None,
     preset: Annotated[str, Option(help="tiny, cpu, live, paper or ridge; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
     threads: Threads = None,
@@ -202,11 +203,8 @@ def eval_command(
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
-    model: Annotated[Path, Argument(help="Folder, mono or stereo. Default: the pretrained one that fits.")],
-    source: Annotated[
-        Path | None,
-        Argument(help="Dataset, store, video, PNGs' folder, or .npz of flow.", show_default=False),
-    ] = None,
+    model: Annotated[Path, Argument(help="Folder, or stereo; `bench estimate` needs none.")],
+    source: Annotated[Path, Argument(help="Dataset, store, video, PNGs' folder, or .npz of flow.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
     input: Input = None,
     young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
@@ -228,21 +226,23 @@ def predict_command(
 
     Exit code 2 if no frame has a force.
     """
-    from learn.inference.apply import open_source
+    from learn.inference.apply import apply
+    from learn.inference.predict import load_model
     from learn.inference.prediction_file import predict_files
-    from learn.inference.video_motion import VideoOptions
+    from learn.inference.video_motion import VideoOptions, motions
     from learn.training.threads import choose_threads
     from synth.flow.recording.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
-    named, source = (None, model) if source is None else (model, source)
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
     predicted = []
-    opened = open_source(source, named, options, input, choose_threads(threads))
-    for file in predict_files(*opened, source, out, young, membrane, overlay):
+    predictor = load_model(model, threads=choose_threads(threads))
+    each = motions(source, predictor.choose_source(input), options)
+    estimate = partial(apply, predictor, young_kpa=young, membrane=membrane)
+    for file in predict_files(estimate, each, source, out, overlay):
         predicted.append(file)
         if not json:
             for note in file.notes:
@@ -285,7 +285,7 @@ def calibrate_command(
 
 @app.command("export", epilog="Example: learn export model d2fnet.onnx")
 def export_command(
-    model: Annotated[Path, Argument(help="Model folder, mono or stereo.")],
+    model: Annotated[Path, Argument(help="Model folder, or stereo.")],
     file: Annotated[Path, Argument(help="ONNX file; FILE.json next to it describes its use.")],
 ) -> None:
     """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""

@@ -20,17 +20,13 @@ import typer
 from ruamel.yaml import YAML
 
 from bench.methods import force_interval
-from bench.methods.comparison import FUSION, MAIN, PHYSICS
-from bench.methods.force_fusion import Fusion
+from bench.methods.comparison import PHYSICS
 from bench.methods.force_interval import CameraModel, IntervalTable, VideoEstimates, describe
-from bench.methods.method_interface import Method
-from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.recording import recording_writer
 from bench.recording.from_sequence import export_recording
 from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
-from learn.inference.shipped_networks import NAMES, choose_model
 from learn.uncertainty.error_model import ErrorModel, fit_error_model
 from synth.arrays import Floats
 from synth.dataset.store import Dataset
@@ -68,7 +64,7 @@ MAKES: Mapping[str, tuple[str, Tree]] = {
     "clinical": ("clinical", {}),
     "calf": ("ex-vivo-calf", {}),
 }
-"""Makes of our own: a named job, and what differs from it. No network was trained on the last four."""
+"""Makes of our own: a named job, and what differs from it."""
 _VIDEO: Tree = {
     "frames": 16,
     "fps": 5,
@@ -78,9 +74,9 @@ _VIDEO: Tree = {
 }
 _SEED = 7001
 FOREIGN = "foreign"
-_USED = "size", "spread", "overall disagreement", "motion"
-"""Features of the error model: of ten sets tried on 18 recordings of seven makes, that with the least score
-on makes left out; without the last two intervals are twice as wide for as much held."""
+_USED = "size", "spread", "overall spread", "motion"
+"""Features of the error model: of nine sets tried on 26 recordings of eight makes, that with the least score
+on makes left out, two cameras."""
 _RIDGE = 0.3  # of the frames: recordings are few
 _LEAST_ERROR = 0.02  # of the largest force: smaller errors are not told apart
 _LEAST_FRAMES = 8
@@ -124,15 +120,11 @@ def intervals(
         for folder, make, stated in _recordings(work, foreign, count, makes.split(",")):
             for much, cameras in product((True, False), (2, 1)):
                 _score(work, folder, make, stated if much else None, cameras)
-    table = fit_table(read_examples(work / "scores"), _networks())
+    table = fit_table(read_examples(work / "scores"))
     text = json.dumps(asdict(table), indent=1, allow_nan=False)
     write_whole(force_interval.TABLE, text + "\n", durable=False)
     for name, row in table.reached.items():
         print(name, {key: round(value, 3) for key, value in row.items()})
-
-
-def _networks() -> dict[str, str]:
-    return {name: Model(choose_model(name == NAMES[1])).identity for name in NAMES}
 
 
 def _merge(tree: Tree, other: Mapping[str, Any]) -> Tree:
@@ -198,16 +190,16 @@ def _score(work: Path, source: Path, make: str, stated: Tree | None, cameras: in
         shutil.rmtree(folder / "right", ignore_errors=True)
         (folder / "right.mp4").unlink(missing_ok=True)
     recording_writer.write_meta(folder, meta | (stated or {}))
-    fusion = Fusion(MAIN, PHYSICS)
-    methods: dict[str, Method] = {FUSION: fusion, MAIN: Model(choose_model(cameras == 2)), PHYSICS: Physics()}
     recording = open_recording(folder)
     scale = recording.scale
     arrays: dict[str, Any] = {"make": make, "recording": source.name}
     try:
-        result = evaluate_recording(recording, methods, FUSION, scale, RecordingFlowSettings(), {})
-        if fusion.video is not None and result.sensor_mn is not None and not result.refused:
+        settings = RecordingFlowSettings()
+        result = evaluate_recording(recording, {PHYSICS: Physics()}, PHYSICS, scale, settings, {})
+        video = result.tracked.evidence
+        if video is not None and result.sensor_mn is not None and not result.refused:
             trusted = np.array(result.tracked.trusted)
-            arrays |= vars(fusion.video)
+            arrays |= vars(video)
             arrays["true_mn"] = np.where(result.scored, result.sensor_mn, np.nan)[trusted]
     except UserError as error:
         arrays["failed"] = str(error)
@@ -225,8 +217,6 @@ def read_examples(folder: Path) -> list[Example]:
                 continue
             video = VideoEstimates(
                 size_mn=stored["size_mn"],
-                network_mn=stored["network_mn"],
-                physics_mn=stored["physics_mn"],
                 spread_mn=stored["spread_mn"],
                 motion_mm=stored["motion_mm"],
                 cameras=int(stored["cameras"]),
@@ -238,10 +228,10 @@ def read_examples(folder: Path) -> list[Example]:
     return examples
 
 
-def fit_table(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTable:
+def fit_table(examples: Sequence[Example]) -> IntervalTable:
     """The calibration on all examples, and what it reaches on each make without that make."""
-    table = _fit(examples, networks)
-    crossed = {make: _fit([e for e in examples if e.make != make], networks) for make in table.makes}
+    table = _fit(examples)
+    crossed = {make: _fit([e for e in examples if e.make != make]) for make in table.makes}
     rows = {id(one): _judge(one, crossed[one.make]) for one in examples}
 
     def pool(some: Sequence[Example]) -> dict[str, float]:
@@ -257,7 +247,7 @@ def fit_table(examples: Sequence[Example], networks: Mapping[str, str]) -> Inter
     return replace(table, stating=_find_gains(examples, rows), reached=reached)
 
 
-def _fit(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTable:
+def _fit(examples: Sequence[Example]) -> IntervalTable:
     by_cameras = {}
     for cameras in (1, 2):
         some = [one for one in examples if one.video.cameras == cameras]
@@ -269,7 +259,6 @@ def _fit(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTa
         features=tuple(force_interval.NAMES),
         by_cameras=by_cameras,
         makes=count,
-        networks=dict(networks),
         flow=name_motion(RecordingFlowSettings().backend),
         stating={},
         reached={},

@@ -10,7 +10,6 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.inference import shipped_networks
 from learn.inference.convert import add_onnx
-from learn.inference.predict import load_model
 from synth.errors import UserError
 from synth.system.checked_file import write_whole
 
@@ -20,24 +19,17 @@ _LIMITS = (
     "Force is proportional to Young's modulus and has at least its relative error.",
     "A membrane (pia) carries load that is not visible at the surface: errors are largest with a membrane.",
 )
-_MONOCULAR = (
-    "The force along the line of sight is hardly visible with one camera; its interval is wide.",
-    "On recordings made with another finite-element code and another renderer its error is about that of "
-    "physics in `bench score` (docs/results/learn/foreign/monocular).",
-)
 
 
 def pack(models: Path, data: list[Path], cache: Path | None = None) -> None:
-    """Measures the networks of a folder (mono and stereo) and writes them into the package.
+    """Measures the networks of a folder, by name, and writes them into the package.
 
     `data`: the dataset that they were fitted on, then others; `cache`: folder for packed arrays.
     """
     rows = measure(data, models, cache)["rows"]
     for name in shipped_networks.NAMES:
         own = [row for row in rows if row["model"] == name]
-        stereo = load_model(models / name).card.settings.arch.depth
-        limits = _LIMITS if stereo else (*_LIMITS, *_MONOCULAR)
-        pack_model(models / name, shipped_networks.MODELS / name, report.commit(), listed(own), limits)
+        pack_model(models / name, shipped_networks.MODELS / name, report.commit(), listed(own), _LIMITS)
 
 
 def pack_model(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import find_peaks
@@ -173,9 +173,9 @@ def _check_hypotheses(sensor: SensorMotion) -> list[Finding]:
     for one in close:
         names.setdefault(one.message.split(":")[0] if one.turns else one.cause, one.message)
     start = missed or "sensor and video contradict each other"
-    # Only what several methods agree on is certain: one may be wrong itself.
-    sure = missed and best.odds > _SURE and len(sensor.forces_mn) > 1
-    sure = sure and all(_agrees(sensor, one, best) for one in sensor.forces_mn)
+    # Only what several estimates agree on is certain: one may be wrong itself.
+    sure = missed and best.odds > _SURE and all(_agrees(sensor, one, best) for one in sensor.forces_mn)
+    sure = sure and (len(sensor.forces_mn) > 1 or _is_shown_by_motion(sensor, best))
     found = f"{start}; most likely {', or '.join(names.values())}"
     return [Finding("error" if sure else "warning", best.hypothesis.cause, found)]
 
@@ -297,6 +297,13 @@ def _agrees(sensor: SensorMotion, force: Floats, best: _Judged) -> bool:
         return abs(np.log(max(gain, 1e-9))) > np.log(_BEYOND) and (gain > 1) == (best.gain > 1)
     every = _judge(sensor, force, (1 / _BEYOND, _BEYOND))
     same = [one for one in every if one.hypothesis.cause == best.hypothesis.cause]
+    return any(one.odds > _SURE and one.explains for one in same)
+
+
+def _is_shown_by_motion(sensor: SensorMotion, best: _Judged) -> bool:
+    """Whether the tissue's mean motion, which knows neither gain nor axes, has the same cause."""
+    motion, cause = replace(sensor, leading_mn=None), best.hypothesis.cause
+    same = [one for one in _judge(motion, *_estimate(motion)) if one.hypothesis.cause == cause]
     return any(one.odds > _SURE and one.explains for one in same)
 
 

@@ -1,8 +1,7 @@
 """Fusion of network and physics, each weighted by its stated error.
 
 The network's estimate is a further observation of the force of which physics gives a mixture over contacts
-and tissues: it shifts each component, and components that contradict it lose weight. Its interval is the
-calibrated one of `force_interval`.
+and tissues: it shifts each component, and components that contradict it lose weight. It states no interval.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.methods.force_interval import VideoEstimates, find_spread, read_table
 from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from synth.arrays import Floats
 from synth.errors import UserError
 
 # Chosen on even sequences of mission-ood and on foreign recordings of seed 600; results are of others.
-_MOST = 100.0  # largest factor of an interval that fails where the force is known
+_MOST = 100.0  # largest factor of an error that is stated too small where the force is known
 # Factor of the network's stated deviation by number of cameras: recordings differ from its training data, but
 # force along the optical axis hardly shows in one camera's motion, of which physics is too sure.
 _CAUTION = {1: 0.25, 2: 1.5}
@@ -28,12 +26,9 @@ class Fusion:
     """The fusion of two methods that state their errors; see the module."""
 
     def __init__(self, network: str, physics: str) -> None:
-        """Names of the two methods; the network's `density` is shown."""
+        """Names of the two methods."""
         self.parts = network, physics
-        self._share, self._alone, self._reason = 0.0, 0, ""
-        self.video: VideoEstimates | None = None
-        """What the last video's interval is computed from; None: a method stated no error."""
-        self.is_calibrated = False  # whether forces with this network and of this motion were
+        self._share, self._alone = 0.0, 0
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: a fusion needs the estimates of its parts."""
@@ -74,43 +69,6 @@ class Fusion:
         self._share = pulled / apart if apart else 0.0
         return fused
 
-    def bound(
-        self,
-        fused: Sequence[ForceEstimate],
-        estimates: Sequence[Mapping[str, ForceEstimate]],
-        scene: MethodContext,
-        cameras: int,
-        motion_mm: Floats,
-        stated: float,
-        network: str,
-    ) -> list[ForceEstimate]:
-        """The forces of `fuse` with the calibrated interval, without one if it has no calibration.
-
-        `motion_mm`: (T,) mean length of the flow; `stated`: as of `VideoEstimates`; `network`: its identity.
-        """
-        self.video, self._reason, self.is_calibrated = None, "", False
-        if self._alone or not fused:
-            return list(fused)
-        table = read_table()
-        self.is_calibrated = table.covers(network, scene.recovered_by)
-        if any(np.isnan(frame[self.parts[1]].low_mn) for frame in estimates):
-            self._reason = f"no interval: {self.parts[1]} states none"
-            return list(fused)
-        by_network, by_physics = (
-            np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
-        )
-        spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
-        sizes = np.array([estimate.size_mn for estimate in fused])
-        self.video = VideoEstimates(sizes, by_network, by_physics, spread, motion_mm, cameras, stated)
-        self._reason = table.find_reason(self.video, network, scene.recovered_by)
-        if self._reason:
-            return list(fused)
-        ends = table.bound(self.video, scene.young_uncertainty)
-        return [
-            replace(one, low_mn=float(low), high_mn=float(high))
-            for one, low, high in zip(fused, *ends, strict=True)
-        ]
-
     @property
     def notes(self) -> list[str]:
         """The weights of the two methods over the video."""
@@ -119,9 +77,9 @@ class Fusion:
 
     @property
     def warnings(self) -> list[str]:
-        """Frames without a fusion, and why there is no interval."""
+        """Frames without a fusion."""
         alone = f"{self._alone} frames use {self.parts[0]} alone: one of the two methods states no error"
-        return [*([alone] if self._alone else []), *([self._reason] if self._reason else [])]
+        return [alone] if self._alone else []
 
 
 def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:

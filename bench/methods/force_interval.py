@@ -1,19 +1,21 @@
-"""One 90% interval of the leading force, from what a video shows and states without the truth.
+"""The 90% interval of physics' force, from what a video shows and states without the truth.
 
 Half the width is P s(x) q. P is the video's largest estimate. s is the expected error over P, log-linear in
-features x of a frame (`ErrorModel`): the size of the estimate, the spread of physics' posterior, which knows
-what is stated and what two cameras see, the disagreement of network and physics over the video, and how much
-the tissue moves. q are the 5% and 95% quantiles of the error over P s, which differ as force is rather missed
-than invented, weighted so that each make and each of its recordings counts alike. `weights.interval_table`
-fits model and quantiles on the same recordings, and states what they hold by cross-validation over makes
-(`reached`). A video whose features lie beyond those of the table's recordings, or whose motion another
-estimator or version of it recovered, has no interval.
+features x of a frame (`ErrorModel`): the size of the estimate, the spread of the posterior, in the frame and
+over the video, which knows what is stated and what two cameras see, and how much the tissue moves. q are the
+5% and 95% quantiles of the error over P s, which differ as force is rather missed than invented, weighted so
+that each make and each of its recordings counts alike. `weights.interval_table` fits model and quantiles on
+the same recordings, and states what they hold by cross-validation over makes (`reached`). A video whose
+features lie beyond those of the table's recordings, or whose motion another estimator or version of it
+recovered, has no interval.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,6 +23,7 @@ import numpy as np
 from pydantic import ConfigDict, FiniteFloat, TypeAdapter
 
 from bench.methods.force_mixture import ForceMixture
+from bench.methods.method_interface import ForceEstimate
 from learn.uncertainty.error_model import ErrorModel
 from synth.arrays import Floats
 from synth.job.types import Positive
@@ -29,19 +32,17 @@ LEVEL = 0.9
 TABLE = Path(__file__).with_suffix(".json")
 NAMES = {
     "size": "size of the force",
-    "disagreement": "disagreement of network and physics",
-    "spread": "spread of physics' posterior",
-    "overall disagreement": "disagreement of network and physics over the video",
-    "overall spread": "spread of physics' posterior over the video",
+    "spread": "spread of the posterior",
+    "overall spread": "spread of the posterior over the video",
     "shape": "disagreement of force and mean flow",
     "motion": "amount of motion",
     "stated": "what is stated",
 }
 """What each feature is, in words."""
-OF_VIDEO = ("overall disagreement", "overall spread", "shape", "motion")
+OF_VIDEO = ("overall spread", "shape", "motion")
 """Features of a video, on which it depends whether the table holds for it."""
 # Added before logarithms, so that small values aren't distinguished; of the largest force, and mm.
-_SIZE, _APART, _SPREAD, _SHAPE, _MOTION_MM = 0.05, 0.03, 0.02, 0.02, 0.005
+_SIZE, _SPREAD, _SHAPE, _MOTION_MM = 0.05, 0.02, 0.02, 0.005
 _LARGEST = 0.98  # quantile over the frames that is the largest: without outliers
 _BEYOND = 0.15  # share of a feature's range by which a video may lie outside it
 NORMAL = 1.645  # 95% quantile of the normal distribution: half of the 90% interval
@@ -51,10 +52,8 @@ NORMAL = 1.645  # 95% quantile of the normal distribution: half of the 90% inter
 class VideoEstimates:
     """The forces of a video's T tracked frames, and what is known of them."""
 
-    size_mn: Floats  # (T,) magnitude of the leading force
-    network_mn: Floats  # (T, 3)
-    physics_mn: Floats  # (T, 3)
-    spread_mn: Floats  # (T,) standard deviation of physics' posterior
+    size_mn: Floats  # (T,) magnitude of the force
+    spread_mn: Floats  # (T,) standard deviation of the posterior
     motion_mm: Floats  # (T,) mean length of the flow over the tissue
     cameras: int
     stated: float
@@ -62,7 +61,7 @@ class VideoEstimates:
 
     @property
     def largest_mn(self) -> float:
-        """The largest leading force's magnitude."""
+        """The largest force's magnitude."""
         return float(np.quantile(self.size_mn, _LARGEST))
 
 
@@ -88,7 +87,6 @@ class IntervalTable:
     features: tuple[str, ...]
     by_cameras: dict[int, CameraModel]
     makes: dict[str, int]  # recordings of each make
-    networks: dict[str, str]  # identities of the calibrated networks, by name
     flow: str  # estimator of their motion and its version, as of `name_motion`
     stating: dict[str, Positive]
     """Mean width of the intervals with what a recording may state over that without it."""
@@ -115,19 +113,14 @@ class IntervalTable:
                 gaps.append(f"{NAMES[name]} ({'low' if values[k] < error.low[k] else 'high'})")
         return gaps
 
-    def covers(self, network: str, recovered_by: str) -> bool:
-        """Whether forces fused with a network, of motion by an estimator and version, were calibrated."""
-        return network in self.networks.values() and recovered_by == self.flow
-
-    def find_reason(self, video: VideoEstimates, network: str, recovered_by: str = "") -> str:
+    def find_reason(self, video: VideoEstimates, recovered_by: str) -> str:
         """Why a video's force has no interval; empty if it has one.
 
-        `network`: its identity; `recovered_by`: estimator of the motion and its version, empty if not known.
+        `recovered_by`: estimator of the motion and its version, empty if not known.
         """
-        if recovered_by and recovered_by != self.flow:
-            return f"no interval: it is calibrated for motion by {self.flow}, and this is by {recovered_by}"
-        if network not in self.networks.values():
-            return "no interval: it is calibrated for the pretrained networks"
+        if recovered_by != self.flow:
+            by = recovered_by or "another"
+            return f"no interval: it is calibrated for motion by {self.flow}, and this is by {by}"
         if gaps := self.find_gaps(video):
             return f"no interval: beyond the recordings that it is calibrated on in {' and '.join(gaps)}"
         return ""
@@ -139,15 +132,43 @@ def read_table() -> IntervalTable:
     return TypeAdapter(IntervalTable).validate_python(json.loads(TABLE.read_text("utf-8")))
 
 
+def bound(
+    estimates: Sequence[ForceEstimate], video: VideoEstimates, gain: float, recovered_by: str
+) -> tuple[list[ForceEstimate], str]:
+    """Physics' estimates of a video with the calibrated interval, or without one and why.
+
+    `gain`, `recovered_by`: as of `IntervalTable.bound` and `find_reason`.
+    """
+    table = read_table()
+    reason = table.find_reason(video, recovered_by)
+    if any(np.isnan(estimate.low_mn) for estimate in estimates):
+        reason = "no interval: the error of forces of this motion isn't bounded"
+    if reason:
+        return [replace(estimate, low_mn=math.nan, high_mn=math.nan) for estimate in estimates], reason
+    ends = table.bound(video, gain)
+    bounded = [
+        replace(estimate, low_mn=float(low), high_mn=float(high))
+        for estimate, low, high in zip(estimates, *ends, strict=True)
+    ]
+    return bounded, ""
+
+
+def gather(
+    estimates: Sequence[ForceEstimate], motion_mm: Floats, cameras: int, stated: float
+) -> VideoEstimates:
+    """What the interval is computed from; `motion_mm` (T,), `cameras`, `stated`: as of `VideoEstimates`."""
+    sizes = np.array([estimate.size_mn for estimate in estimates])
+    spread = np.array([find_spread(estimate.likely) if estimate.likely else np.nan for estimate in estimates])
+    return VideoEstimates(sizes, spread, motion_mm, cameras, stated)
+
+
 def describe(video: VideoEstimates) -> Floats:
     """Features (T, F) of a video's frames, in the order of `NAMES`."""
     size, most = video.size_mn, max(video.largest_mn, 1e-9)
-    apart = np.linalg.norm(video.network_mn - video.physics_mn, axis=1)
     whole = max(_rms(size), 1e-9)
     moves = np.ptp(video.motion_mm) > 0 and np.ptp(size) > 0
     r = float(np.corrcoef(video.motion_mm, size)[0, 1]) if moves else 0.0
     of_video = (
-        np.log(_rms(apart) / whole + _APART),
         np.log(_rms(video.spread_mn) / whole + _SPREAD),
         np.log(1 + _SHAPE - r),
         np.log(float(np.quantile(video.motion_mm, _LARGEST)) + _MOTION_MM),
@@ -155,7 +176,6 @@ def describe(video: VideoEstimates) -> Floats:
     )
     columns = (
         np.log(size / most + _SIZE),
-        np.log(apart / most + _APART),
         np.log(video.spread_mn / most + _SPREAD),
         *(np.full(len(size), value) for value in of_video),
     )

@@ -30,7 +30,7 @@ from bench.methods.method_interface import (
 from bench.methods.posterior import LoadBasis, Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
-from synth.arrays import Floats, Mask
+from synth.arrays import Floats, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import touches_border
@@ -135,7 +135,7 @@ class Physics:
         if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
             self._weighed_mm = observed.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
-        return self._estimate(observed, picture)
+        return self._conclude(*self._infer(observed), picture=picture)
 
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
@@ -161,7 +161,24 @@ class Physics:
         else:
             self._gains = find_gains(self._scene, self._weights, self._large)
         self._contact_free = int(contact_free.sum())
-        return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
+        answers = [self._infer(frame) for frame in self._frames]
+        self._loads = [answer.load.astype(np.float32) for answer, *_ in answers]
+        return widen_small_forces([self._conclude(*answer, picture=False) for answer in answers])
+
+    @property
+    def view(self) -> GridView:
+        """`GRID` on the last video's pictures."""
+        return self._view
+
+    def map_forces(self) -> Map:
+        """(T, N, N) magnitude of the force density in `GRID`'s cells [kPa], of the last `revise`."""
+        assert self._scene is not None
+        young, middle = self._scene.young_kpa or UNKNOWN_YOUNG_KPA, ((GRID.size - 1) / 2,) * 2
+        maps = []
+        for load in self._loads:
+            lattice, step = self._lattice(load)
+            maps.append(to_image(young * lattice, (GRID.size,) * 2, middle, GRID.pitch_mm, step))
+        return np.stack(maps)
 
     @property
     def notes(self) -> list[str]:
@@ -196,33 +213,43 @@ class Physics:
         may_be_covered = self._scene is not None and self._scene.membrane != "stripped"
         return self._gains.unsolved > 0 and len(self._weights.own_mm) == 2 and may_be_covered
 
-    def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
+    def _conclude(self, answer: Posterior, least: float, most: float, picture: bool) -> ForceEstimate:
+        """The estimate of `_infer`'s answer."""
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        linear = infer(self._weights, frame)
-        least, most = self._gains.at(float(np.linalg.norm(linear.force.mean)))
-        factor = float(np.sqrt(least * most))
-        answer = replace(linear, force=linear.force.times(factor), load=factor * linear.load)
-        gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
+        factor, cameras = float(np.sqrt(least * most)), len(self._weights.own_mm) - 1
+        gain = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty))
         low, high = size_interval(answer.force, gain, cameras)
         low, high = (np.nan, np.nan) if self._is_beyond else (low * least / factor, high * most / factor)
-        density = np.float32(young) * self._picture(answer) if picture else None
+        density = np.float32(young) * self._picture(answer.load) if picture else None
         likely = answer.force.times(young).with_gain(
             float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
         )
         size = young * answer.force.find_size(cameras)
         return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely, size)
 
-    def _picture(self, answer: Posterior) -> Field:
+    def _infer(self, frame: Observation) -> tuple[Posterior, float, float]:
+        """The posterior with the gain of large motion, and the ends of that gain."""
+        linear = infer(self._weights, frame)
+        least, most = self._gains.at(float(np.linalg.norm(linear.force.mean)))
+        factor = float(np.sqrt(least * most))
+        return replace(linear, force=linear.force.times(factor), load=factor * linear.load), least, most
+
+    def _picture(self, load: Floats) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
-        basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
-        known, view = basis.lattice, self._view
+        (lattice, step), view = self._lattice(load), self._view
+        return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, step)
+
+    def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
+        """The force density over E at the nodes of a square lattice about the tissue's centre, and their
+        distance [mm]."""
+        known = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0]).lattice
         step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
         column, row = np.rint(known.nodes / step).astype(int).T
         most = max(column.max(), row.max())
         lattice = np.zeros((2 * most + 1,) * 2)
-        lattice[row + most, column + most] = np.linalg.norm(answer.load, axis=1) / known.node_area
-        return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
+        lattice[row + most, column + most] = np.linalg.norm(load, axis=1) / known.node_area
+        return lattice, float(step)
 
 
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.methods.comparison import PHYSICS
 from bench.methods.force_interval import LEVEL, NORMAL, read_table
 from bench.scoring.result import Result
 
@@ -49,7 +50,7 @@ def answer(result: Result) -> Answers:
 def find_gains(result: Result, size: float, low: float, high: float) -> tuple[str, ...]:
     """What isn't stated or known, each with the width [mN] of this interval with it, the narrowest first."""
     video, width = result.tracked.evidence, high - low
-    if video is None:
+    if video is None or result.main != PHYSICS:
         return ()
     stating, widths = read_table().stating, dict[str, float]()
     if video.cameras == 1:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.methods.comparison import FUSION, PHYSICS
+from bench.methods.comparison import PHYSICS
 from bench.scoring import force_metrics
 from bench.scoring.result import Result
 from synth.arrays import Floats
@@ -31,8 +31,8 @@ def draw_force(result: Result, others: bool = False) -> str:
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
-    # The intervals of physics and of the fusion include the uncertainty of E; none includes that of scale.
-    holds_young = method.low_mn is not None and result.main in (PHYSICS, FUSION)
+    # The interval of physics includes the uncertainty of E; none includes that of scale.
+    holds_young = method.low_mn is not None and result.main == PHYSICS
     spread = 1.96 * (2 * result.scale.uncertainty if holds_young else result.relative_uncertainty)
 
     def draw(axes: Axes) -> None:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 from bench.bootstrap import Interval
-from bench.methods.comparison import FUSION, MAIN
 from bench.scoring.force_metrics import METRICS
 from bench.scoring.result import Result
 from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
@@ -66,7 +65,7 @@ def headline(result: Result) -> Headline:
 
 def _trust(result: Result) -> str:
     """One sentence on the assumed tissue and scale and, without findings, on frames and motion."""
-    meta, network = result.settings["meta"], MAIN if result.main == FUSION else result.main
+    meta, network = result.settings["meta"], result.main
     parts = [] if result.findings else [f"None of {len(result.lost)} frames was lost"]
     scored = result.methods.get(network)
     # Networks without intervals have no check of their training distribution.

@@ -21,7 +21,7 @@ from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result, as_json
 from bench.tracking.tracking import Progress
 from learn import Predictor
-from learn.inference.shipped_networks import choose_model, find_model
+from learn.inference.shipped_networks import find_model
 from synth.arguments import checked
 from synth.errors import UserError
 from synth.flow.recording.decode import RecordingFlowSettings
@@ -40,6 +40,7 @@ def score(
     model: str | Path | Predictor | None = None,
     *,
     methods: Mapping[str, Method] | None = None,
+    main: str | None = None,
     baselines: bool = True,
     settings: Settings | None = None,
     out: str | Path | None = None,
@@ -51,10 +52,12 @@ def score(
 
     Args:
         recording: its folder, or the result of `open_recording`.
-        model: from `learn.load_model`, its folder, mono or stereo; its name in the tables is D2FNet. Without
-            model and methods, the pretrained model for the recording's cameras.
-        methods: further methods by name; without a model the result is about the first.
-        baselines: whether physics and the plug-ins' methods are scored too.
+        model: from `learn.load_model`, its folder, or the name of a pretrained one; its name in the tables is
+            D2FNet.
+        methods: further methods by name.
+        main: name of the method that the result is about; None: the model's, else the first of `methods`,
+            else physics.
+        baselines: whether physics and the plug-ins' methods are scored next to a model or methods.
         settings: flow back end, rate, masks; None: the command's defaults.
         out: folder for score.json and report.html, which are written together.
         title: heading of the report.
@@ -70,7 +73,10 @@ def score(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(Path(recording))
-    model = _choose_model(model, methods or {}, recording.has_stereo)
+    if taken := {FUSION, MAIN} & set(methods or {}):
+        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
+    named = find_model(model) if isinstance(model, (str, Path)) else model
+    network = None if named is None else Model(named)
     frames = len(recording.numbers) or None
     bar: AbstractContextManager[Progress]
     bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
@@ -81,40 +87,28 @@ def score(
         # Another process is given an estimator by its name.
         if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
             flow = stack.enter_context(open_flow_process())
-        network = None if model is None else Model(model)
-        chosen = _choose_methods(network, model, methods or {}, baselines)
-        scale, main = recording.scale, next(iter(chosen))
+        chosen = _choose_methods(network, methods or {}, baselines)
+        first = next(iter(chosen)) if main is None else main
+        if first not in chosen:
+            raise UserError(f"main {first}: no such method; one of {', '.join(chosen)}")
         about = _describe(chosen)
         with bar as done:
-            result = evaluate_recording(recording, chosen, main, scale, used, about, done, flow)
+            result = evaluate_recording(recording, chosen, first, recording.scale, used, about, done, flow)
         if out is not None:
             write_result(result, Path(out), title)
     return result
 
 
-def _choose_model(
-    model: str | Path | Predictor | None, own: Mapping[str, Method], stereo: bool
-) -> Path | Predictor | None:
-    """The model to score, None: only own methods. UserError if the arguments don't fit each other."""
-    if taken := {FUSION, *([MAIN] if model is not None or not own else [])} & set(own):
-        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
-    if model is None and not own:
-        return choose_model(stereo)
-    return find_model(model) if isinstance(model, (str, Path)) else model
-
-
-def _choose_methods(
-    network: Model | None, model: Path | Predictor | None, own: Mapping[str, Method], baselines: bool
-) -> dict[str, Method]:
-    """All methods by name, in the table's order; the result is about the first."""
+def _choose_methods(network: Model | None, own: Mapping[str, Method], baselines: bool) -> dict[str, Method]:
+    """All methods by name, in the table's order."""
     chosen: dict[str, Method] = {} if network is None else {MAIN: network}
     for name, one in own.items():
         chosen[name] = one if isinstance(one, Model) else Plugged(one, f"method {name}")
-    if baselines:
+    if baselines or not chosen:
         simple = comparison.simpler_methods()
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
-    if model is not None and isinstance(chosen.get(PHYSICS), Physics):
-        chosen = {FUSION: Fusion(MAIN, PHYSICS), **chosen}
+    if network is not None and isinstance(chosen.get(PHYSICS), Physics):
+        chosen[FUSION] = Fusion(MAIN, PHYSICS)
     return chosen
 
 

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.methods import force_interval
 from bench.methods.force_fusion import Fusion
 from bench.methods.force_interval import VideoEstimates
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
+from bench.methods.physics import Physics
 from bench.recording.footage import as_footage
 from bench.recording.recording_folder import Recording
 from bench.sensor.alignment import align_sensor
@@ -78,7 +80,8 @@ class TrackedRecording:
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
     stereo: PairQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
-    evidence: VideoEstimates | None = None  # from which the interval of the leading fusion is computed
+    evidence: VideoEstimates | None = None  # from which the interval of physics is computed
+    unbounded: dict[str, str] = field(default_factory=dict)  # by method: why it has no interval
     stated: tuple[bool, ...] = (False,) * 4  # tissue, instruments, membrane, rest or ex vivo
     pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
 
@@ -156,21 +159,16 @@ def _describe(
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
     doubt = {name: getattr(method, "doubt", ()) for name, method in methods.items()}
-    parts = {name: one.parts if isinstance(one, Fusion) else (name,) for name, one in methods.items()}
-    # The interval of a fusion is calibrated with its network as it is, or there is none.
-    out.uncalibrated = {name for name, one in methods.items() if doubt[name] and not isinstance(one, Fusion)}
-    leading, first = parts.get(pictured, ()), methods.get(pictured)
-    # Forces fused with this network, of this motion, were measured: what it learnt on isn't in doubt.
-    doubted = () if isinstance(first, Fusion) and first.is_calibrated else leading
-    out.doubt = [Finding("warning", part, note) for part in doubted for note in doubt.get(part, ())]
+    out.uncalibrated = {name for name in methods if doubt[name]}
+    out.doubt = [Finding("warning", pictured, note) for note in doubt.get(pictured, ())]
     for name, method in methods.items():
-        warnings = getattr(method, "warnings", ())
-        notes = [*(() if name in leading else doubt[name]), *getattr(method, "notes", ())]
-        # A network's doubts are in the interval of the fusion that leads, the range of physics is not.
-        is_finding = name == pictured or name in leading[1:]
-        out.notes += [f"{name}: {note}" for note in (notes if is_finding else [*notes, *warnings])]
-        if is_finding:
+        reason = out.unbounded.get(name)
+        warnings = [*getattr(method, "warnings", ()), *([reason] if reason else [])]
+        notes = [*(() if name == pictured else doubt[name]), *getattr(method, "notes", ())]
+        if name == pictured:
             out.findings += [Finding("warning", name, warning) for warning in warnings]
+            warnings = []
+        out.notes += [f"{name}: {note}" for note in [*notes, *warnings]]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
@@ -195,10 +193,8 @@ class _Forces:
         scene: MethodContext,
     ) -> None:
         """Starts with the rest frame and the constants of the recording."""
-        shown = methods.get(pictured)
-        self.pictured = shown.parts[0] if isinstance(shown, Fusion) else pictured
-        self.methods, self.watch, self.scene = methods, watch, scene
-        self.out = TrackedRecording(pictured=self.pictured, rest=_shrunk(rest.rgb))
+        self.methods, self.pictured, self.watch, self.scene = methods, pictured, watch, scene
+        self.out = TrackedRecording(pictured=pictured, rest=_shrunk(rest.rgb))
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: Map | None = None
@@ -260,18 +256,28 @@ class _Forces:
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
-                    self.out.stated = _find_stated(recording, self.scene)
-                    share, moved = float(np.mean(self.out.stated)), np.array(self.motion_mm)[trusted]
-                    network = getattr(self.methods[method.parts[0]], "identity", "")
-                    fused = method.bound(fused, tracked, self.scene, self.cameras, moved, share, network)
-                    self.out.evidence = method.video
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate
                 for frame in self.estimates:
                     frame.setdefault(name, frame[method.parts[0]])
+        self.out.stated = _find_stated(recording, self.scene)
+        for name, method in self.methods.items():
+            if isinstance(method, Physics) and tracked:
+                self._bound(name, tracked, np.array(self.motion_mm)[trusted])
+        for name in self.methods:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.size_mn[name] = [_measure(frame[name]) for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
+
+    def _bound(self, name: str, tracked: Sequence[dict[str, ForceEstimate]], moved_mm: Floats) -> None:
+        """Gives physics, of this name, its calibrated interval in the tracked frames."""
+        estimates = [frame[name] for frame in tracked]
+        share, out = float(np.mean(self.out.stated)), self.out
+        out.evidence = force_interval.gather(estimates, moved_mm, self.cameras, share)
+        common = self.scene.young_uncertainty, self.scene.recovered_by
+        bounded, out.unbounded[name] = force_interval.bound(estimates, out.evidence, *common)
+        for frame, estimate in zip(tracked, bounded, strict=True):
+            frame[name] = estimate
 
     def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""

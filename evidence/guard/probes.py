@@ -221,13 +221,13 @@ def probe_compliance() -> Arrays:
 
 
 def probe_score() -> Arrays:
-    """The score of a stored recording with one camera of which scale and stiffness are stated."""
+    """The score of a stored recording with one camera of which scale and stiffness are stated, by physics."""
     return _score("mono")
 
 
 def probe_score_stereo() -> Arrays:
-    """The score of a stored recording with two cameras."""
-    return _score("stereo")
+    """The score of a stored recording with two cameras, by physics and the pretrained network."""
+    return _score("stereo", "--model", "stereo")
 
 
 PROBES: Mapping[str, Probe] = {
@@ -355,12 +355,14 @@ def _answer(model: Path) -> Any:
         return network(ramp.repeat(1, channels, 1, 1)).numpy()
 
 
-def _score(name: str) -> Arrays:
+def _score(name: str, *options: str) -> Arrays:
     """Forces by every method of `bench score`, and their errors, with nothing from the user's cache."""
     from typer.testing import CliRunner
 
     with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
-        done = CliRunner().invoke(bench_app, ["score", str(RECORDINGS / name), "-o", f"{folder}/out"])
+        done = CliRunner().invoke(
+            bench_app, ["score", str(RECORDINGS / name), *options, "-o", f"{folder}/out"]
+        )
         if done.exit_code:
             raise RuntimeError(f"bench score {name}: {done.output} {done.exception!r}")
         score = json.loads(Path(folder, "out/score.json").read_text("utf-8"))

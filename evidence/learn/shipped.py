@@ -25,7 +25,7 @@ def measure(
 ) -> dict[str, Any]:
     """Errors and coverage of networks on the first dataset, which they were fitted on, and on others.
 
-    `models`: folder of mono and stereo; `cache`: folder for packed arrays.
+    `models`: folder of the networks by name; `cache`: folder for packed arrays.
     """
     rows = []
     for name in shipped_networks.NAMES:

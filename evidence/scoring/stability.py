@@ -12,7 +12,6 @@ recordings show what each further statement gains.
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,6 @@ from evidence import report
 from evidence import result_cache as stored
 from evidence.scoring.degradations import FPS, FRAMES, MONOCULAR, STEREO, Change, read_meta, read_table
 from evidence.study import Study
-from learn import load_model
-from learn.inference.shipped_networks import choose_model
 from synth.dataset.store import Dataset
 from synth.engine.run import render_job
 from synth.errors import UserError
@@ -159,19 +156,14 @@ def degrade(source: Path, change: Change | None, case: Mapping[str, Any], work: 
     return folder
 
 
-@cache
-def _model(stereo: bool) -> Any:
-    return load_model(choose_model(stereo))
-
-
 def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: Path, *key: Any) -> Any:
-    """Errors of the leading force and width of its interval, of the peak, and findings; cached in `work`."""
+    """Errors of physics' force and width of its interval, of the peak, and findings; cached in `work`."""
 
     def compute() -> dict[str, Any]:
         row: dict[str, Any] = dict.fromkeys(("error", "over_time", "width", "held"))
         folder = degrade(source, change, case, work)
         try:
-            result = score(folder, _model(case["cameras"] == 2))
+            result = score(folder)
         except UserError as error:
             return {**row, "findings": [str(error).replace(f"{folder}: ", "")]}
         row["findings"] = [f"{one.cause}: {one.message}" for one in result.findings]

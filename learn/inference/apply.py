@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,24 +12,22 @@ import numpy as np
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.predict import Predictor, force_size, load_model, net_force
-from learn.inference.shipped_networks import choose_model
-from learn.inference.video_motion import Motion, VideoOptions, has_right_camera, motions
+from learn.inference.video_motion import Motion, motions, read_only, read_options
 from learn.uncertainty.conformal import LEVELS
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
-from synth.errors import UserError, as_positive
+from synth.errors import UserError
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.finding import first_fault, judge_young, problems
 from synth.job.types import MembraneState
-from synth.video.mask_files import read_choice
 from synth.video.read_video import FPS
 
 
 @checked
 def predict(
     source: str | Path | Array,
-    model: Predictor | str | Path | None = None,
+    model: Predictor | str | Path,
     *,
     scale_mm_per_px: float | Literal["unknown"] | None = None,
     young_kpa: float | None = None,
@@ -43,12 +41,12 @@ def predict(
     fps: float = FPS,
     input: str | None = None,
 ) -> dict[str, Any]:
-    """Forces of one video, as `learn predict` estimates them, by the names of its NAME.npz.
+    """Forces of one video by a network, as `learn predict` estimates them, by the names of its NAME.npz.
 
     Args:
         source: frames (T, H, W, 3) uint8 from the rest frame on, a video, a folder of PNGs, a sequence or an
             .npz of flow.
-        model: from `load_model`, or its folder; None: the pretrained one that fits.
+        model: from `load_model`, its folder or the name of a pretrained one.
         scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia), for a model with that input.
@@ -64,33 +62,12 @@ def predict(
     Raises:
         UserError: an argument of another type, shape or range, or a source of several videos.
     """
-    as_positive("fps", fps)
     source = Path(source) if isinstance(source, str) else source
-    kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
-    tissue = Path(tissue) if isinstance(tissue, str) else tissue
-    settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse, kind)
-    options = VideoOptions(scale_mm_per_px, tissue, settings, tool, fps)
-    predictor, each = open_source(source, model, options, input)
-    motion = next(each)
-    if next(each, None) is not None:
-        raise UserError(f"source: {source} holds several sequences: give one of them")
+    settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
+    options = read_options(scale_mm_per_px, tissue, masks, settings, fps)
+    predictor = model if isinstance(model, Predictor) else load_model(model)
+    motion = read_only(source, motions(source, predictor.choose_source(input), options))
     return apply(predictor, motion, young_kpa, membrane)
-
-
-def open_source(
-    source: Path | Array,
-    model: Predictor | str | Path | None,
-    options: VideoOptions,
-    input: str | None,
-    threads: int = 1,
-) -> tuple[Predictor, Iterator[Motion]]:
-    """The model, by default the pretrained one that fits, and the motions of a source for it.
-
-    `threads`: of a model that is given by its name.
-    """
-    named = model or choose_model(has_right_camera(source))
-    predictor = named if isinstance(named, Predictor) else load_model(named, threads=threads)
-    return predictor, motions(source, predictor.choose_source(input), options)
 
 
 def apply(

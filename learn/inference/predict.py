@@ -33,7 +33,7 @@ def load_model(name: Path | str, *, threads: int = 1) -> Predictor:
     """A trained model, to be called frame by frame (`Predictor`) or for a whole video (`predict_force`).
 
     Args:
-        name: the folder that `learn train` wrote, or `mono` or `stereo` for a pretrained network.
+        name: the folder that `learn train` wrote, or `stereo` for the pretrained network.
         threads: CPU threads of the network.
 
     Raises:

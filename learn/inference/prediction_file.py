@@ -1,10 +1,13 @@
-"""Output of `learn predict`: NAME.npz with the arrays of `FIELDS`, NAME.force.csv and NAME.force.mp4."""
+"""Output of `learn predict` and `bench estimate`.
+
+NAME.npz holds the arrays of `FIELDS`, NAME.force.csv the curve, NAME.force.mp4 the force over the video.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +15,11 @@ import cv2
 import numpy as np
 
 from learn.data.grid import to_image
-from learn.inference.apply import apply
-from learn.inference.predict import Predictor, length
+from learn.inference.predict import length
 from learn.inference.video_motion import Motion
 from synth.arrays import Floats, Pixels
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
-from synth.job.types import MembraneState
 from synth.publish import picture, sequence_video
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
@@ -49,7 +50,7 @@ FIELDS: dict[str, PredictedField] = {
     "high68_mn": PredictedField("T", "mN", "upper end of the size's 68% interval"),
     "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the components' 90% intervals, camera axes"),
     "force_high_mn": PredictedField("T, 3", "mN", "upper ends of the components' 90% intervals, camera axes"),
-    "level": PredictedField("2", "-", "0.9, 0.68 of the intervals; absent: not calibrated for this motion"),
+    "level": PredictedField("L", "-", "0.9 and 0.68 of the intervals that there are; absent: not calibrated"),
     "mask": PredictedField("N, N", "-", "cells with tissue"),
     "pitch_mm": PredictedField("", "mm", "width of a cell"),
     "scale_mm_per_px": PredictedField("", "mm/px", "of the video's own pixels"),
@@ -76,26 +77,24 @@ class PredictedFile(NamedTuple):
 
 
 def predict_files(
-    predictor: Predictor,
+    estimate: Callable[[Motion], dict[str, Any]],
     each: Iterable[Motion],
     source: Path,
     out: Path,
-    young_kpa: float | None = None,
-    membrane: MembraneState = "unknown",
     overlay: bool = False,
 ) -> Iterator[PredictedFile]:
     """Estimates and writes the forces of each video of a source, one after the other, into the folder `out`.
 
-    `predictor`, `each`: of `open_source`; `young_kpa`, `membrane`: as of `apply`; `overlay`: whether to write
-    NAME.force.mp4 where the source has pictures. UserError as those, and for a file that would overwrite its
-    source.
+    `estimate`: the forces of a motion, as of `apply`; `each`: the source's motions; `overlay`: whether to
+    write NAME.force.mp4 where the source has pictures. UserError as those, and for a file that would
+    overwrite its source.
     """
     alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
     for motion in each:
         stem = out / motion.name
         if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
             raise UserError(f"{file}: is the input and would be overwritten; choose another --out")
-        prediction = apply(predictor, motion, young_kpa, membrane)
+        prediction = estimate(motion)
         write_prediction(prediction, stem)
         if overlay:
             write_overlay(prediction, source if alone else source / f"{motion.name}.zarr", stem)

@@ -1,4 +1,5 @@
-"""The pretrained networks, `mono` (one camera) and `stereo`, each a folder in `MODELS`."""
+"""The pretrained network of force, `stereo` (two cameras), a folder in `MODELS`: an example, as physics errs
+less on other programs' recordings."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from learn.checkpoint import ModelCard
 from synth.job import identity
 
 MODELS = Path(__file__).parents[1] / "models"
-NAMES = ("mono", "stereo")
+NAMES = ("stereo",)
 LICENCE = "Apache-2.0"
 """Of the shipped weights, as of the code: they were trained on this project's renders alone."""
 
@@ -17,11 +18,6 @@ LICENCE = "Apache-2.0"
 def find_model(named: Path | str) -> Path:
     """The folder of a model: a folder of that name, else of the pretrained network."""
     return MODELS / named if str(named) in NAMES and not Path(named).exists() else Path(named)
-
-
-def choose_model(stereo: bool) -> Path:
-    """The default network's folder, for recordings of one camera or stereo ones."""
-    return MODELS / NAMES[stereo]
 
 
 def find_name(card: ModelCard) -> str:

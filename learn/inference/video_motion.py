@@ -23,7 +23,7 @@ from synth.flow.recording.video_track import track_video
 from synth.flow.stereo.stereo_track import Moved
 from synth.system import checked_file
 from synth.video import read_video as video
-from synth.video.mask_files import MaskFiles
+from synth.video.mask_files import MaskFiles, read_choice
 from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 
@@ -53,6 +53,29 @@ class VideoOptions:
     settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
     tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
     fps: float = video.FPS  # of pictures without times
+
+
+def read_options(
+    scale_mm_per_px: StatedScale | None,
+    tissue: str | Path | Array | None,
+    masks: str | Path | Array,
+    settings: RecordingFlowSettings,
+    fps: float,
+) -> VideoOptions:
+    """The options of a video from the arguments of `learn.predict` and `bench.estimate`; UserError if one is
+    out of range. The masks' kind replaces that of the settings."""
+    as_positive("fps", fps)
+    kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
+    tissue = Path(tissue) if isinstance(tissue, str) else tissue
+    return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps)
+
+
+def read_only(source: Path | Array, each: Iterator[Motion]) -> Motion:
+    """The motion of a source that holds one video. UserError if it holds several."""
+    motion = next(each)
+    if next(each, None) is not None:
+        raise UserError(f"source: {source} holds several sequences: give one of them")
+    return motion
 
 
 def motions(path: Path | Array, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:

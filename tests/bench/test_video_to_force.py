@@ -1,4 +1,4 @@
-"""`learn predict` and `bench score` give the same forces for a video."""
+"""`learn predict`, `bench estimate` and `bench score` give the same forces for a video."""
 
 import json
 from pathlib import Path
@@ -51,3 +51,24 @@ def test_predict_and_score_agree_at_every_frame(
             assert found["force_mn"] == pytest.approx(axes, rel=1e-6, abs=1e-8)
         assert found["young_kpa"] == (young or 1.0)
         assert bool(found["young_known"]) == (young is not None)
+
+
+@pytest.mark.slow
+def test_estimate_and_score_agree_in_force_and_interval(make: Maker, tmp_path: Path) -> None:
+    folder = make(frames=16, footage="mp4", meta={"tissue": "ex-vivo", "poisson": [0.4, 0.49]})
+    cv2.imwrite(str(folder / "tissue.png"), np.full((96, 128), 255, np.uint8))
+    words = [folder / "video.mp4", "--scale", 0.2, "--tissue", folder / "tissue.png", "--young", 1.0]
+    run(bench.cli.app, "estimate", *words, "--membrane", "stripped", "--ex-vivo", "-o", tmp_path / "forces")
+    run(bench.cli.app, "score", folder, "-o", tmp_path / "score")
+    curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
+    with np.load(tmp_path / "forces" / "video.npz") as found:
+        assert found["frame"].tolist() == curve["frame"]
+        size = np.array(curve["predicted_mn"]["physics"])
+        assert np.ptp(size) > 0.1 * size.max() > 0
+        assert found["total_force_mn"] == pytest.approx(size, rel=1e-6)
+        for end in ("low_mn", "high_mn"):
+            ends = np.array(curve.get(end, {}).get("physics", np.full(len(size), np.nan)), np.float64)
+            assert found[end] == pytest.approx(ends, rel=1e-6, nan_ok=True) if end in found else True
+        total = found["density"].sum(axis=(1, 2, 3)) * found["pitch_mm"] ** 2
+        assert (total >= 0.95 * np.linalg.norm(found["force_mn"], axis=1)).all(), "lengths sum up to more"
+    assert (tmp_path / "forces" / "video.force.csv").stat().st_size > 0

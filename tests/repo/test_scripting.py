@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -34,7 +35,7 @@ HEAVY = {"numpy", "pydantic", "torch", "mitsuba", "drjit", "scipy", "cv2", "zarr
         ("import synth.sequence.pipeline, synth.flow.recording.flow", {"torch"}),
         ("import synth.cli, learn.cli, bench.cli", {"torch", "numpy", "onnxruntime", "numba", "cv2"}),
         ("import synth, bench.scoring.score, bench.checks.check_recording, bench.tracking.live", {"torch"}),
-        ("import synth, learn; learn.load_model('mono')", {"torch", "onnx"}),
+        ("import synth, learn; learn.load_model('stereo')", {"torch", "onnx"}),
     ],
 )
 def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> None:
@@ -44,19 +45,19 @@ def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> No
     assert not set(found) & light
 
 
-PREDICT = """
+ESTIMATE = """
 import numpy as np
-from learn.cli import app
+from bench.cli import app
 shape = (2, 48, 64)
 np.savez("press.npz", flow=np.ones((*shape, 2)), tissue=np.ones(shape[1:]), scale_mm_per_px=0.5)
-app(["predict", "press.npz", "--out", "out"], standalone_mode=False)
+app(["estimate", "press.npz", "--out", "out"], standalone_mode=False)
 """
 
 
 @pytest.mark.parametrize(
     "program",
     [
-        PREDICT,
+        ESTIMATE,
         "from bench.cli import app; app(['score', '--help'], standalone_mode=False)",
         "from bench.cli import app; app(['check', '.'], standalone_mode=False)",
         pytest.param(
@@ -64,7 +65,7 @@ app(["predict", "press.npz", "--out", "out"], standalone_mode=False)
             marks=pytest.mark.slow,
         ),
     ],
-    ids=["learn predict", "bench score --help", "bench check", "synth preview"],
+    ids=["bench estimate", "bench score --help", "bench check", "synth preview"],
 )
 def test_only_training_imports_pytorch(program: str, tmp_path: Path) -> None:
     program = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules))\n" + program
@@ -93,6 +94,12 @@ GREY = np.full((2, 40, 40, 3), 90, np.uint8)
 FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
 
 
+def predict_force(*given: Any) -> Any:
+    """By a network with one camera."""
+    with tempfile.TemporaryDirectory() as folder:
+        return learn.predict_force(learn.load_model(write_model(Path(folder) / "model")), *given)
+
+
 @pytest.mark.parametrize(
     ("named", "call"),
     [
@@ -101,10 +108,13 @@ FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
         ("flwo", lambda: synth.recover_flow(GREY, GREY[..., 0] > 0, GREY[0, ..., 0] < 0, "flwo")),
         ("frames", lambda: synth.recover_flow(GREY / 255, GREY[..., 0] > 0, GREY[0, ..., 0] < 0)),  # type: ignore[arg-type]
         ("tool", lambda: synth.recover_flow(GREY, GREY[0, ..., 0] > 0, GREY[0, ..., 0] < 0)),
-        ("young_kpa", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, math.nan)),
-        ("flow", lambda: learn.predict_force(learn.load_model("mono"), FLOW * math.nan, TISSUE, 0.1)),
-        ("tissue", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE[0], 0.1)),
-        ("confidence", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, 1.0, FLOW)),
+        ("young_kpa", lambda: predict_force(FLOW, TISSUE, 0.1, math.nan)),
+        ("flow", lambda: predict_force(FLOW * math.nan, TISSUE, 0.1)),
+        ("tissue", lambda: predict_force(FLOW, TISSUE[0], 0.1)),
+        ("confidence", lambda: predict_force(FLOW, TISSUE, 0.1, 1.0, FLOW)),
+        ("scale", lambda: bench.estimate(GREY)),
+        ("young_kpa", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE, young_kpa=-1.0)),
+        ("tissue", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE[0])),
     ],
 )
 def test_an_invalid_argument_is_refused_by_name(named: str, call: Callable[[], object]) -> None:
@@ -135,7 +145,7 @@ def test_a_model_estimates_force_and_the_bench_scores_it(out: Path, tmp_path: Pa
     assert {"D2FNet", "none"} <= set(result.methods)
     assert result.methods["none"].scores["mae_mn"] == pytest.approx(np.abs(result.sensor_mn).mean(), rel=0.2)
     assert {path.name for path in tmp_path.iterdir()} == {"model", "recording"}, "scoring writes no files"
-    assert bench.score(recording, settings=every, baselines=False).main == "D2FNet", "a pretrained one"
+    assert bench.score(recording, settings=every, baselines=False).main == "physics"
 
 
 @pytest.mark.trial

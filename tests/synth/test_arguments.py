@@ -22,8 +22,9 @@ CALLS: dict[Any, tuple[Any, ...]] = {
     synth.write_scene: ({"scene": None, "folder": "out"}, "scene"),
     synth.open_sequence: ({}, "path"),
     synth.TorchDataset: ({"root": ".", "fields": ["rgb"]}, "root", "fields"),
-    learn.load_model: ({"name": "mono"}, "name", "threads"),
-    learn.predict: ({"source": "video.mp4"}, "model", "membrane", "flow"),
+    learn.load_model: ({"name": "stereo"}, "name", "threads"),
+    learn.predict: ({"source": "video.mp4", "model": "stereo"}, "model", "membrane", "flow"),
+    bench.estimate: ({"source": "video.mp4"}, "membrane", "flow"),
     bench.score: ({"recording": "here"}, "recording", "model", "settings", "out"),
 }
 

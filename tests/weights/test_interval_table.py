@@ -1,32 +1,34 @@
 """The calibrated interval, on videos whose error is drawn: coverage by make, sharpness, where it ends."""
 
 import json
+import math
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from bench.methods.force_interval import NAMES, IntervalTable, VideoEstimates, describe, read_table
+from bench.methods.force_interval import (
+    NAMES,
+    IntervalTable,
+    VideoEstimates,
+    bound,
+    describe,
+    gather,
+    read_table,
+)
+from bench.methods.force_mixture import ForceMixture
+from bench.methods.method_interface import ForceEstimate
 from weights.interval_table import Example, fit_table
-
-NETWORKS = {"mono": "a", "stereo": "b"}
 
 
 def draw(make: int, number: int) -> Example:
-    """A press of 24 frames; network and physics disagree by as much as their mean is off, on average."""
+    """A press of 24 frames, whose estimate is off by as much as the posterior is wide, on average."""
     rng = np.random.default_rng([make, number])
     curve = np.sin(np.linspace(0, np.pi, 24)) ** 2 * rng.uniform(2, 40)
-    apart = np.exp(rng.uniform(np.log(0.03), np.log(0.6)))
-    off = 1 + apart * rng.normal()
-    way = np.array([0.6, 0.0, 0.8])
-    both = np.stack([off + apart, off - apart])[:, None] * curve + 0.01 * curve.max() * rng.normal(
-        size=(2, 24)
-    )
-    parts = both[..., None] * way
-    spread = apart * curve + 0.02 * curve.max()
-    video = VideoEstimates(np.abs(both.mean(axis=0)), *parts, spread, 0.02 * curve, 2, float(number % 2))
+    wide = np.exp(rng.uniform(np.log(0.03), np.log(0.6)))
+    size = np.abs((1 + wide * rng.normal()) * curve + 0.01 * curve.max() * rng.normal(size=24))
+    video = VideoEstimates(size, wide * curve + 0.02 * curve.max(), 0.02 * curve, 2, float(number % 2))
     return Example(f"make {make}", str(number), video, curve)
 
 
@@ -39,15 +41,15 @@ def held(table: IntervalTable, one: Example) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def table() -> IntervalTable:
-    return fit_table([draw(make, k) for make in range(6) for k in range(8)], NETWORKS)
+    return fit_table([draw(make, k) for make in range(6) for k in range(8)])
 
 
-def test_new_videos_are_held_and_widths_follow_the_disagreement(table: IntervalTable) -> None:
+def test_new_videos_are_held_and_widths_follow_the_posterior(table: IntervalTable) -> None:
     new = [draw(99, k) for k in range(150)]
     shares, widths = np.array([held(table, one) for one in new]).T
     assert 0.85 < shares.mean() < 0.96
-    apart = [describe(one.video)[0, list(NAMES).index("overall disagreement")] for one in new]
-    order = np.argsort(apart)
+    spread = [describe(one.video)[0, list(NAMES).index("overall spread")] for one in new]
+    order = np.argsort(spread)
     assert widths[order[:30]].mean() < 0.6 * widths[order[-30:]].mean()
     assert table.reached["all"]["score over a constant width's"] < 0.8
     assert 0.82 < table.reached["all"]["holds"] < 0.97
@@ -61,13 +63,32 @@ def test_an_uncertain_stiffness_widens_it_in_proportion_to_the_force(table: Inte
     assert (lower <= low).all()
 
 
-def test_a_video_beyond_the_calibration_and_another_network_have_none(table: IntervalTable) -> None:
+def test_a_video_beyond_the_calibration_and_another_motion_have_none_but_a_reason(
+    table: IntervalTable,
+) -> None:
     video = draw(0, 0).video
-    assert table.find_reason(video, "a") == ""
-    assert table.find_reason(video, "another")
-    assert table.find_reason(replace(video, cameras=1), "a")
-    far: NDArray[np.float64] = video.network_mn * 50
-    assert "disagreement" in table.find_reason(replace(video, network_mn=far), "a")
+    assert table.find_reason(video, table.flow) == ""
+    for other in ("", "dis 1"):
+        assert table.find_reason(video, other)
+    assert table.find_reason(replace(video, cameras=1), table.flow)
+    assert "spread" in table.find_reason(replace(video, spread_mn=50 * video.spread_mn), table.flow)
+
+
+def test_estimates_get_ends_or_none() -> None:
+    curve = np.sin(np.linspace(0, np.pi, 24)) ** 2
+    likely = [ForceMixture(np.ones(1), c * np.eye(3)[:1], 0.04 * c**2 * np.eye(3)[None]) for c in 5 * curve]
+    every = [ForceEstimate(one.mean, low_mn=0.0, high_mn=9.0, likely=one) for one in likely]
+    video = gather(every, 0.05 * curve, 2, 0.5)
+    np.testing.assert_allclose(video.spread_mn, 0.2 * np.sqrt(3) * 5 * curve, atol=1e-6)
+    bounded, reason = bound(every, video, 0.0, read_table().flow)
+    assert reason == ""
+    assert all(one.low_mn <= one.size_mn <= one.high_mn != 9.0 for one in bounded)
+    unknown = [*every[:-1], replace(every[-1], low_mn=math.nan, high_mn=math.nan)]
+    for estimates, by in ((every, "dis 1"), (unknown, read_table().flow)):
+        bounded, reason = bound(estimates, video, 0.0, by)
+        assert reason
+        assert np.isnan([one.high_mn for one in bounded]).all()
+        assert [one.size_mn for one in bounded] == [one.size_mn for one in every]
 
 
 def test_the_stored_table_is_read_back(table: IntervalTable) -> None:

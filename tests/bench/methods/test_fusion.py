@@ -1,13 +1,9 @@
 """Fusion of network and physics, against closed forms of Gaussians and draws from stated errors."""
 
-import math
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.force_fusion import Fusion
-from bench.methods.force_interval import read_table
 from bench.methods.force_mixture import ForceMixture
 from bench.methods.method_interface import ForceEstimate, MethodContext
 
@@ -57,21 +53,3 @@ def test_the_magnitude_counts_the_component_that_the_motion_does_not_show() -> N
         (fused,) = Fusion("network", "physics").fuse(frames, SCENE, cameras)
         np.testing.assert_allclose(np.linalg.norm(fused.force_mn), 3.0, rtol=0.01)
         np.testing.assert_allclose(fused.size_mn, size, rtol=0.04)
-
-
-def test_without_a_calibrated_network_there_is_no_interval_but_a_reason() -> None:
-    every = [estimate([np.array([size, 0.0, 0.0])], [0.01], [1.0]) for size in (10.0, 0.3, 1.0)]
-    frames, fusion = [{"network": o, "physics": o} for o in every], Fusion("network", "physics")
-    fused = fusion.fuse(frames, SCENE, 1)
-    known = next(iter(read_table().networks.values()))
-    for network in (known, "unknown"):
-        bound = fusion.bound(fused, frames, SCENE, 1, np.ones(3), 0.0, network)
-        assert [one.size_mn for one in bound] == [one.size_mn for one in fused]
-    assert len(fusion.warnings) == 1
-    assert np.isnan([one.high_mn for one in bound]).all()
-    assert fusion.video is not None
-    np.testing.assert_allclose(fusion.video.spread_mn, 0.01 * np.sqrt(3))
-    beyond = [{"network": o, "physics": replace(o, low_mn=math.nan, high_mn=math.nan)} for o in every]
-    bound = fusion.bound(fused, beyond, SCENE, 1, np.ones(3), 0.0, known)
-    assert fusion.video is None
-    assert np.isnan([one.high_mn for one in bound]).all()

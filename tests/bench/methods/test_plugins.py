@@ -55,7 +55,8 @@ def test_a_plug_in_is_scored_with_the_network(
     model = write_model(tmp_path / "model", "arch.output=vector")
     settings = bench.Settings(rate_hz=None, pulse=False)
     result = bench.score(recording, model, settings=settings, out=tmp_path / "score")
-    assert next(iter(result.methods)) == "network and physics"
+    assert next(iter(result.methods)) == result.main == "D2FNet"
+    assert {"physics", "network and physics"} < set(result.methods)
     own = result.methods["pushes"]
     assert own.scores["mae_mn"] < np.nanmean(np.abs(result.sensor_mn)) / 3
     assert own.worse_by_mn is not None, "paired with the network on the same frames"

@@ -54,7 +54,7 @@ def test_the_first_sequence_that_no_model_was_trained_on(tmp_path: Path) -> None
         phantom.write(tmp_path / "data", index, anatomy_seed=7, frames=3)
     hashes = [sequence.attrs["content_hash"] for sequence in Dataset(tmp_path / "data")]
     model = write_model(tmp_path / "model")
-    words = ["from-dataset", tmp_path / "data", "--unseen-by", "mono", "--unseen-by", model, "-o"]
+    words = ["from-dataset", tmp_path / "data", "--unseen-by", "stereo", "--unseen-by", model, "-o"]
     for parts, exported in ((["fit", "select"], ["000002"]), (["test", "intervals"], ["000000"])):
         split = {part: [content] for part, content in zip(parts, hashes, strict=False)}
         write_card(model, replace(read_card(model), split=split))

@@ -119,10 +119,10 @@ def test_shape_error_of_a_wrong_curve(make: Maker) -> None:
 def test_an_interval_has_a_level_for_motion_as_in_training(motion: str, make: Maker, tmp_path: Path) -> None:
     folder = write_model(tmp_path / "model", "arch.output=vector")
     write_card(folder, replace(read_card(folder), motion=[motion], intervals=fake_intervals.make()))
-    result = run(make(), fusion=Fusion("network", "bump"), network=Model(folder), bump=Bump())
+    result = run(make(), network=Model(folder), fusion=Fusion("network", "bump"), bump=Bump())
     methods = as_json(result)["methods"]
     assert ("level" in methods["network"]["interval"]) == (motion != "tvl1 0")
-    assert "interval" not in methods["fusion"], "calibrated for the pretrained networks alone"
+    assert "interval" not in methods["fusion"]
     for note in read_card(folder).doubt(name_motion("tvl1")):
         assert headline(result).warnings[0] == note
         assert render_report(result).count(note) == 1
@@ -134,12 +134,13 @@ class Bounded(Bump):
     warnings = ("beyond the range",)
 
 
-def test_the_range_of_the_physics_in_a_fusion_is_a_finding(make: Maker) -> None:
+def test_the_range_of_the_method_that_the_result_is_about_is_a_finding(make: Maker) -> None:
     folder = make(frames=4)
-    for network, physics in ((Bump(), Bounded()), (Bounded(), Bump())):
-        result = run(folder, fusion=Fusion("network", "bump"), network=network, bump=physics)
+    for first, second in ((Bump(), Bounded()), (Bounded(), Bump())):
+        result = run(folder, first=first, second=second)
         stated = [finding.message for finding in result.findings if finding.message in Bounded.warnings]
-        assert len(stated) == isinstance(physics, Bounded)
+        assert len(stated) == isinstance(first, Bounded)
+        assert f"second: {Bounded.warnings[0]}" in result.notes or isinstance(first, Bounded)
 
 
 def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Maker) -> None:
@@ -168,10 +169,9 @@ def test_the_first_screen_has_four_answers_in_few_words(make: Maker) -> None:
 
 
 def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
-    result = run(make())
-    curve = result.methods["bump"].size_mn
-    way = curve[:, None] * np.array([1.0, 0.0, 0.0])
-    one = VideoEstimates(curve, way, way, 0.1 * curve, 0.01 * curve, 1, 0.5)
+    result = run(make(), physics=Bump())
+    curve = result.methods["physics"].size_mn
+    one = VideoEstimates(curve, 0.1 * curve, 0.01 * curve, 1, 0.5)
     result.tracked.evidence, result.tracked.stated = one, (True, False, True, False)
     gains = find_gains(result, 10.0, 6.0, 14.0)
     ratios = read_table().stating

@@ -17,7 +17,6 @@ from bench.recording.recording_folder import open_recording
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
 from bench.tracking.tracking import TrackedRecording
-from learn.cli import app as learn
 from synth.flow.recording.finding import Finding, Severity
 
 # E in Pa and in MPa, the scale in metres, pixels that are millimetres wide.
@@ -45,8 +44,8 @@ def test_a_refused_score_writes_its_files_and_exits_with_code_2(
     assert done.exit_code == code, done.output
     assert ("MAE [mN]" in done.stdout) == (code == 0)  # the table
     assert {"score.json", "report.html"} == {one.name for one in (folder / "score").iterdir()}
-    words = ["mono", str(folder / "frames"), "--scale", "0.2", "--young", str(young), "-o", str(folder / "p")]
-    assert CliRunner().invoke(learn, ["predict", *words]).exit_code == (0 if young < 9 else 2)
+    words = [str(folder / "frames"), "--scale", "0.2", "--young", str(young), "-o", str(folder / "p")]
+    assert CliRunner().invoke(app, ["estimate", *words]).exit_code == (0 if young < 9 else 2)
 
 
 @pytest.mark.parametrize(("rest", "free"), [(6, [[0.0, 0.05]]), (0, [[0.2, 0.8]])])
@@ -110,6 +109,8 @@ def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
 def test_a_sensor_that_agrees_or_is_doubtful_is_no_error() -> None:
     assert findings(PRESS, METHODS) == set()
     assert findings(PRESS, [60 * PRESS]) == {("warning", "force")}, "one method may be wrong itself"
+    late = np.roll(PRESS, 6, axis=0)
+    assert findings(late, [0.8 * PRESS]) == {("error", "clocks")}, "the tissue's mean motion shows it too"
     spiked = PRESS + 400 * (np.arange(len(PRESS)) == 3)[:, None]
     noise = np.random.default_rng(1).normal(0, 0.3, PRESS.shape)
     for doubtful in (spiked, noise):

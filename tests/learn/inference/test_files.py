@@ -62,7 +62,7 @@ def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
 )
 def test_a_card_with_an_absurd_number_is_refused(changed: dict[str, Any], tmp_path: Path) -> None:
     """Its seal matches: whoever made it meant it."""
-    card = read_card(MODELS / "mono")
+    card = read_card(MODELS / "stereo")
     scales = replace(card.scales, **changed.pop("scales", {}))
     write_card(tmp_path / "model", replace(card, **changed, scales=scales))
     with pytest.raises(UserError, match="must be from"):
