@@ -64,10 +64,11 @@ class ForceEstimate:
 
     @property
     def size_mn(self) -> float:
-        """The force's magnitude: `expected_mn` where it is known, else that of `force_mn`."""
+        """The force's magnitude: `expected_mn`, else that of `force_mn`; NaN if neither is known."""
         if np.isfinite(self.expected_mn):
             return self.expected_mn
-        return float(np.sqrt(np.nansum(self.force_mn**2)))
+        known = self.force_mn[np.isfinite(self.force_mn)]
+        return float(np.linalg.norm(known)) if len(known) else math.nan
 
 
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -80,7 +79,7 @@ class TrackedRecording:
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
     stereo: PairQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
-    evidence: VideoEstimates | None = None  # from which the interval of physics is computed
+    evidence: VideoEstimates | None = None  # from which the interval of physics is computed; None: unbounded
     unbounded: dict[str, str] = field(default_factory=dict)  # by method: why it has no interval
     stated: tuple[bool, ...] = (False,) * 4  # tissue, instruments, membrane, rest or ex vivo
     pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
@@ -266,16 +265,17 @@ class _Forces:
                 self._bound(name, tracked, np.array(self.motion_mm)[trusted])
         for name in self.methods:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
-            self.out.size_mn[name] = [_measure(frame[name]) for frame in self.estimates]
+            self.out.size_mn[name] = [frame[name].size_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
 
     def _bound(self, name: str, tracked: Sequence[dict[str, ForceEstimate]], moved_mm: Floats) -> None:
         """Gives physics, of this name, its calibrated interval in the tracked frames."""
         estimates = [frame[name] for frame in tracked]
         share, out = float(np.mean(self.out.stated)), self.out
-        out.evidence = force_interval.gather(estimates, moved_mm, self.cameras, share)
+        video = force_interval.gather(estimates, moved_mm, self.cameras, share)
         common = self.scene.young_uncertainty, self.scene.recovered_by
-        bounded, out.unbounded[name] = force_interval.bound(estimates, out.evidence, *common)
+        bounded, out.unbounded[name] = force_interval.bound(estimates, video, *common)
+        out.evidence = None if any(np.isnan(estimate.low_mn) for estimate in estimates) else video
         for frame, estimate in zip(tracked, bounded, strict=True):
             frame[name] = estimate
 
@@ -289,11 +289,6 @@ class _Forces:
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2
-
-
-def _measure(estimate: ForceEstimate) -> float:
-    """Magnitude of an estimate; NaN where it has no component."""
-    return estimate.size_mn if np.isfinite(estimate.force_mn).any() else math.nan
 
 
 def _find_stated(recording: Recording, scene: MethodContext) -> tuple[bool, ...]:

@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 import synth
 from bench.cli import app as bench_app
@@ -64,7 +65,7 @@ _PICTURES: dict[str, list[str]] = {
     ],
     "randomized": ["seed=4", "randomize.texture=1", "randomize.surroundings=1", "randomize.light=1"],
 }
-_TRUTH = ("flow", "visible", "tool", "depth", "traction", "motion", "force")
+_TRUTH = ("flow", "visible", "tool", "traction", "motion", "force")
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,13 @@ def probe_mechanics() -> Arrays:
 
 
 def probe_picture() -> Arrays:
-    """Pictures of both cameras, highlights and shadows, of a usual and of a randomised scene."""
+    """Pictures of both cameras, depth, highlights and shadows, of a usual and of a randomised scene."""
     arrays: Arrays = {}
     for name, keys in _PICTURES.items():
         frames = _frames(keys)
         arrays[f"{name}: left"] = np.stack([frame.rgb for frame in frames])
+        depth = np.stack([frame.depth for frame in frames])
+        arrays[f"{name}: depth"] = np.where(np.isfinite(depth), depth, 0.0)
         arrays[f"{name}: highlights"] = np.stack([frame.glare for frame in frames])
         if frames[0].shadow is not None:
             arrays[f"{name}: shadows"] = np.stack([np.asarray(frame.shadow) for frame in frames])
@@ -125,13 +128,17 @@ def probe_picture() -> Arrays:
 
 def probe_truth() -> Arrays:
     """Labels of geometry and force on the pixels of a scene with two cameras, and the poses of the camera."""
-    frames = _frames(_PICTURES["stereo"])
+    scene = synth.simulate(_load("tiny", *_SMALL, *_PICTURES["stereo"]))
+    frames = [scene.frame(t) for t in range(len(scene))]
     arrays: Arrays = {}
     for name in _TRUTH:
         values = np.stack([getattr(frame, name) for frame in frames]).astype(np.float64)
-        # No value where a ray meets nothing; how many there are is part of `visible` and `depth` itself.
+        # No value where a ray meets nothing; how many there are is part of `visible` itself.
         arrays[name] = np.where(np.isfinite(values), values, -1.0)
-    arrays["depth"] -= arrays["depth"].max()  # the relief, not the distance of the camera
+    # The tissue's alone: what lies around it is part of the look. The relief, not the camera's distance.
+    inside = binary_erosion(scene.tissue, iterations=3)
+    depth = np.stack([frame.depth for frame in frames]).astype(np.float64)[:, inside]
+    arrays["depth of the tissue"] = depth - depth.max()
     poses = np.stack([frame.camera.pose for frame in frames])
     arrays["camera"], arrays["motion of the camera"] = poses[0], poses - poses[0]
     return arrays

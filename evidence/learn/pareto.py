@@ -190,6 +190,6 @@ STUDY = Study(
     "learn/pareto/pareto.json",
     page,
     ("--dataset {mission} --cache {work}/networks",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "network"),
+    needs=("mesh", "mechanics", "truth", "network"),
     timed=True,
 )

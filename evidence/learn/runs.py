@@ -122,5 +122,5 @@ STUDY = Study(
     "learn/losses/losses.json",
     page,
     ("{mission} --cache {work}/losses",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "network"),
+    needs=("mesh", "mechanics", "truth", "network"),
 )

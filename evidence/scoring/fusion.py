@@ -104,9 +104,10 @@ def _row(tissue: str, name: str, found: Sequence[dict[str, Any]]) -> dict[str, A
         off, peak = np.linalg.norm(force, axis=1) - size, size.max()
         scores["whole"].append(float(np.sqrt(np.square(force - true).sum() / np.square(true).sum())))
         scores["bias"].append(float(off[size > _STRONG * peak].mean() / peak))
-        scores["coverage"].append(float(((size >= low) & (size <= high)).mean()))
+        if np.isfinite(low).all():
+            scores["coverage"].append(float(((size >= low) & (size <= high)).mean()))
     row = {"tissue": tissue, "method": name, "sequences": len(found)}
-    return row | {key: mean_of(values) for key, values in scores.items()}
+    return row | {key: mean_of(values) if values else None for key, values in scores.items()}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -119,7 +120,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "method": row["method"],
             "force": report.mean_cell(row["whole"], ".0%"),
             "bias of strong presses": report.mean_cell(row["bias"], ".0%"),
-            "coverage": report.mean_cell(row["coverage"], ".0%"),
+            "coverage": row["coverage"] and report.mean_cell(row["coverage"], ".0%"),
         }
         for row in unknown
     ]
