@@ -126,6 +126,9 @@ def estimate(
     scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
     young: Young = None,
     membrane: Annotated[MembraneState, Option(help="Of the pia.")] = "unknown",
+    membrane_mn_per_mm: Annotated[
+        tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
+    ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     masks: Masks = "auto",
@@ -156,7 +159,14 @@ def estimate(
     options = VideoOptions(read_scale(scale), tissue, settings, files)
     threadpool_limits(choose_threads())
     given = tissue is not None, files is not None
-    find = partial(apply_physics, young_kpa=young, membrane=membrane, living=living, is_given=given)
+    find = partial(
+        apply_physics,
+        young_kpa=young,
+        membrane=membrane,
+        membrane_mn_per_mm=membrane_mn_per_mm,
+        living=living,
+        is_given=given,
+    )
     peaks, notes = dict[str, float | None](), dict[str, list[str]]()
     for file in predict_files(
         find, motions(source, choose_input(source, input), options), source, out, overlay

@@ -37,6 +37,8 @@ class MethodContext:
     """Estimator and version of the motion; empty: unknown."""
     alpha: tuple[float, float] = (-20.0, 2.0)
     """Range of the exponent of Ogden's law, for motion beyond the linear range."""
+    membrane_mn_per_mm: tuple[float, float] | None = None
+    """Range of the membrane's stiffness, its thickness times its Young's modulus; None: unknown."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import map_coordinates
-from scipy.special import softmax
+from scipy.special import log_softmax, softmax
 
 from bench.methods import compliance, large_motion, posterior
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
@@ -34,7 +34,6 @@ from synth.arrays import Floats, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import touches_border
-from synth.job.types import MembraneState
 
 GRID = Grid(48)
 
@@ -46,12 +45,20 @@ class TissueConstants:
     membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
     intact: float = 0.33  # prior probability of a membrane
+    stiff_mn_per_mm: float = (
+        50.0  # median of its stiffness: 0.05 to 0.2 mm of 100 to 1000 kPa (MembraneSection)
+    )
+    stiffer: float = 1.0  # deviation of that stiffness' logarithm
+    doubt: float = 2.0
+    """Largest difference of log evidence between stiffnesses: strong loads differ from the model's, and by
+    their evidence a membrane was softer by a factor of 3 to 20 than it was."""
+    shown: int = 3  # stiffnesses in a posterior, the likeliest
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
     cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
     wide: float = 1.2  # radius of the visible tissue, in openings, above which no skull edge is assumed
     temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
     strongest: int = 8  # frames that weight the tissues, every third
-    stronger: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
+    growth: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
     living_mm: float = 0.4  # own motion of living tissue, half of 0.8 mm peak to peak (Faria 2014)
     quiet: float = 0.2  # least share of the frames, or of a breath, that shows the tissue's own motion
     unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
@@ -132,7 +139,7 @@ class Physics:
                 self._large.append((observed, surface))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
-        if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
+        if observed.signal_mm > max(TISSUES.growth * self._weighed_mm, posterior.MODEL.least_mm):
             self._weighed_mm = observed.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
         return self._conclude(*self._infer(observed), picture=picture)
@@ -278,8 +285,11 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     low, high = scene.poisson
     middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
-    every = TISSUES.membranes_mm
-    stiff = {"stripped": every[:1], "intact": every[1:], "unknown": every}[scene.membrane]
+    none, *every = TISSUES.membranes_mm
+    if scene.membrane_mn_per_mm is not None:
+        ends = np.array(scene.membrane_mn_per_mm) / (scene.young_kpa or UNKNOWN_YOUNG_KPA)
+        every = sorted({float(f"{stiff:.2g}") for stiff in np.geomspace(ends[0], ends[1], TISSUES.shown)})
+    stiff = {"stripped": [none], "intact": every, "unknown": [none, *every]}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
     if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
@@ -291,11 +301,19 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     )
 
 
-def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
-    if known != "unknown":
-        return np.full(len(tissues), 1 / len(tissues))
-    stiff, intact = np.array([tissue.membrane > 0 for tissue in tissues]), TISSUES.intact
-    return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
+def _prior(tissues: Sequence[TissueKind], scene: MethodContext) -> Floats:
+    """Logarithm of each tissue's prior probability: log-normal in a membrane's stiffness, unless that is
+    stated."""
+    stiff = np.array([tissue.membrane for tissue in tissues])
+    covered, spread = stiff > 0, TISSUES.stiffer if scene.membrane_mn_per_mm is None else np.inf
+    stiffness = np.log(np.where(covered, stiff, 1.0) * (scene.young_kpa or UNKNOWN_YOUNG_KPA))
+    density = -0.5 * np.square((stiffness - np.log(TISSUES.stiff_mn_per_mm)) / spread)
+    share = {"intact": 1.0, "stripped": 0.0, "unknown": TISSUES.intact}[scene.membrane]
+    out = np.full(len(tissues), -np.inf)
+    for part, weight in ((covered, share), (~covered, 1 - share)):
+        if part.any() and weight > 0:
+            out[part] = np.log(weight) + log_softmax(np.where(part, density, -np.inf)[part])
+    return out
 
 
 def weigh_tissues(
@@ -304,41 +322,48 @@ def weigh_tissues(
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
     strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [frame for frame in strongest if frame.size_mm > 0]
+    known: dict[TissueKind, float] = {}  # evidence of those that are computed
 
     def evidence(tissue: TissueKind, load: Callable[..., LoadBasis] = posterior.load_basis) -> float:
-        basis = load(len(own_mm), tissue)
-        return TISSUES.temper * sum(posterior.evidence(basis, frame, own_mm) for frame in strongest)
-
-    candidates = candidate_tissues(scene)
-    logs = dict(zip(candidates, np.log(_prior(candidates, scene.membrane)), strict=True))
-    known: dict[TissueKind, float] = {}  # those of the candidates that are computed
-
-    def posterior_log(tissue: TissueKind) -> float:
         if tissue not in known:
-            known[tissue] = evidence(tissue) + logs[tissue]
+            basis = load(len(own_mm), tissue)
+            every = (posterior.evidence(basis, frame, own_mm) for frame in strongest)
+            known[tissue] = TISSUES.temper * sum(every)
         return known[tissue]
 
+    candidates = candidate_tissues(scene)
+    logs = dict(zip(candidates, _prior(candidates, scene), strict=True))
+    score = dict[TissueKind, float]()
     for part in (False, True):
         if group := [each for each in candidates if (each.membrane > 0) is part]:
-            find_largest(group, posterior_log)
-    tissues = list(known)
-    score = [known[tissue] for tissue in tissues]
-    best = int(np.argmax(score))
+            best = find_largest(group, lambda tissue: evidence(tissue) + logs[tissue])
+            # The interval is to hold the most likely tissue with and without a membrane.
+            alike = [each for each in group if replace(each, membrane=best.membrane) == best]
+            score |= _share(alike, [evidence(each) for each in alike], [logs[each] for each in alike])
+    best = max(score, key=lambda tissue: score[tissue])
     low, high = scene.poisson
-    others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
-    first = evidence(tissues[best]) if others else 0.0
+    others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != best.poisson]
     score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
     for nu in others:
-        tissues.append(replace(tissues[best], poisson=nu))
-        score.append(score[best] + evidence(tissues[-1], posterior.load_basis_alone) - first)
-    weight = np.maximum(softmax(score), TISSUES.unlikely)
-    # The interval is to hold the most likely tissue with and without a membrane, and each Poisson's ratio.
-    covered = [tissue.membrane > 0 for tissue in known]
-    parts = [[k for k in range(len(known)) if covered[k] is part] for part in (False, True)]
-    used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(len(known), len(tissues))}
-    order = sorted(used, key=lambda k: -weight[k])
-    weight = weight[order] / weight[order].sum()
-    return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed)
+        tissue = replace(best, poisson=nu)
+        score[tissue] = score[best] + evidence(tissue, posterior.load_basis_alone) - evidence(best)
+    weight = np.maximum(softmax(list(score.values())), TISSUES.unlikely)
+    order = np.argsort(-weight, kind="stable")
+    tissues = list(score)
+    return TissueWeights(tuple(tissues[k] for k in order), weight[order] / weight.sum(), own_mm, assumed)
+
+
+def _share(
+    tissues: Sequence[TissueKind], evidence: Sequence[float], logs: Sequence[float]
+) -> dict[TissueKind, float]:
+    """Log weights of the likeliest of tissues that differ in stiffness alone, with differences of evidence of
+    at most `TISSUES.doubt`, and together the weight of the likeliest."""
+    best = float(np.max(np.add(evidence, logs)))
+    behind = np.subtract(evidence, max(evidence))
+    weight = np.add(-TISSUES.doubt * -np.expm1(behind / TISSUES.doubt), logs)
+    likeliest = np.argsort(-weight, kind="stable")[: TISSUES.shown]
+    shares = best + log_softmax(weight[likeliest])
+    return {tissues[k]: float(share) for k, share in zip(likeliest, shares, strict=True)}
 
 
 def find_largest(candidates: Sequence[TissueKind], value: Callable[[TissueKind], float]) -> TissueKind:

@@ -218,6 +218,9 @@ class Meta(Section):
     """Relative standard uncertainty of `young_kpa`."""
     membrane: MembraneState = "unknown"
     """Whether the tissue still has its membrane (pia, arachnoid): `intact`, `stripped` or `unknown`."""
+    membrane_mn_per_mm: Annotated[tuple[Positive, Positive], AfterValidator(_must_not_fall)] | None = None
+    """Range of its stiffness, thickness times Young's modulus [mN/mm], e.g. of a strip that was pulled: what
+    force by physics depends on most where there is a membrane. Default: unknown, some 10 to 250."""
     poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
     """Range of the tissue's Poisson's ratio."""
     alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)

@@ -31,6 +31,7 @@ def estimate(
     scale_mm_per_px: float | Literal["unknown"] | None = None,
     young_kpa: float | None = None,
     membrane: MembraneState = "unknown",
+    membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
     tissue: str | Path | Array | None = None,
     masks: str | Path | Array = "auto",
@@ -49,6 +50,7 @@ def estimate(
         scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia).
+        membrane_mn_per_mm: range of its stiffness, thickness times Young's modulus; None: unknown.
         living: whether heart and breath may move the tissue; False: ex vivo, or a phantom.
         tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.
         masks: auto or none; or instrument masks: (T, H, W), (H, W) or a folder.
@@ -71,7 +73,7 @@ def estimate(
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps)
     motion = read_only(source, motions(source, choose_input(source, input), options))
     is_given = tissue is not None, not isinstance(masks, str) or masks not in ("auto", "none")
-    return apply_physics(motion, young_kpa, membrane, living, is_given)
+    return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, is_given)
 
 
 def choose_input(source: Path | Array, given: str | None) -> str:
@@ -84,18 +86,30 @@ def apply_physics(
     motion: Motion,
     young_kpa: float | None = None,
     membrane: MembraneState = "unknown",
+    membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
     is_given: tuple[bool, bool] = (False, False),
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa`, `membrane`, `living`: as of `estimate`; `is_given`: whether tissue and instruments are.
+    `young_kpa` to `living`: as of `estimate`; `is_given`: whether tissue and instruments are.
     Returns those of `learn.inference.prediction_file.FIELDS` that there are.
     """
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
     scale, by = motion.scale_mm_per_px, motion.recovered_by
-    scene = MethodContext(motion.tissue, scale, young, membrane, living=living, recovered_by=by)
+    if membrane_mn_per_mm is not None:
+        low, high = (as_positive("membrane_mn_per_mm", end) for end in membrane_mn_per_mm)
+        membrane_mn_per_mm = min(low, high), max(low, high)
+    scene = MethodContext(
+        motion.tissue,
+        scale,
+        young,
+        membrane,
+        living=living,
+        recovered_by=by,
+        membrane_mn_per_mm=membrane_mn_per_mm,
+    )
     physics, free = Physics(), ContactFreeSearch(motion.tissue, scale)
     rows, moved_mm, cameras = list[tuple[int, float, bool]](), list[float](), 1
     for frame in motion.frames():

@@ -115,7 +115,8 @@ def track_recording(
         mm_per_px = scale_mm_per_px * video.rest.shrink
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
         backend = name_motion(settings.backend)
-        scene = MethodContext(video.rest.tissue, mm_per_px, *known, backend, about.alpha)
+        stiff = about.membrane_mn_per_mm
+        scene = MethodContext(video.rest.tissue, mm_per_px, *known, backend, about.alpha, stiff)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         turning = SurfaceMotion(video.rest.tissue)
         free = ContactFreeSearch(video.rest.tissue, mm_per_px)

@@ -159,6 +159,30 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
     assert {(one.membrane, one.poisson) for one in physics.candidate_tissues(stated)} == {(0.0, 0.49)}
 
 
+@pytest.mark.slow
+def test_a_stated_stiffness_of_the_membrane_gives_the_force(basis: LoadBasis) -> None:
+    side, tissue, young = 80, TissueKind("bonded", 40.0, 0.45), 2.0
+    known = np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, young, "intact", (0.45, 0.45)
+    frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
+    true, sizes = np.hypot(1.0, 4.0), []
+    for stiff in ((60.0, 100.0), (4.0, 8.0)):
+        scene = MethodContext(*known, membrane_mn_per_mm=stiff)
+        found = physics.weigh_tissues(scene, frames, STILL)
+        assert {one.membrane for one in found.tissues} <= {30.0, 39.0, 50.0, 2.0, 2.8, 4.0}
+        sizes.append(float(np.linalg.norm(physics.infer(found, frames[1]).force.mean)))
+    assert sizes[0] == pytest.approx(true, rel=0.15)
+    assert sizes[1] < 0.9 * sizes[0], "a membrane that is stated too soft hides force"
+
+
+def test_evidence_for_a_soft_membrane_is_not_taken_for_certain() -> None:
+    every = [TissueKind("bonded", membrane, 0.45, 1.02) for membrane in (5.0, 15.0, 40.0, 100.0)]
+    shares = physics._share(every, [0.0, -20.0, -80.0, -400.0], [-1.0, -1.0, -1.0, -1.0])
+    weight = np.exp(list(shares.values()))
+    assert len(shares) == 3
+    assert weight.sum() == pytest.approx(np.exp(-1.0)), "together as likely as the likeliest"
+    assert weight.max() / weight.min() == pytest.approx(np.exp(2.0), rel=0.01)
+
+
 def test_the_quietest_frames_bound_the_tissues_own_motion() -> None:
     """A pulse of known amplitude, with a contact in a half of the frames."""
     time_s, none = np.arange(100) / 10, np.full((2, 9), 0.001)
