@@ -84,6 +84,16 @@ class TissueWeights:
     own_mm: Floats  # (C, 6, M) modes of the tissue's own motion, see `own_motion`
     assumed: bool  # whether that is a bound on what is not known, so that it may be 0
 
+    @property
+    def middle(self) -> TissueKind:
+        """The tissue to solve large motion on: of those like the likeliest in all but stiffness the one
+        nearest to their mean, as the likeliest of them is hardly likelier than others."""
+        first = self.tissues[0]
+        alike = [k for k, one in enumerate(self.tissues) if replace(one, membrane=first.membrane) == first]
+        stiff = np.log([max(self.tissues[k].membrane, 1e-3) for k in alike])
+        mean = float(np.average(stiff, weights=self.weight[alike]))
+        return self.tissues[alike[int(np.abs(stiff - mean).argmin())]]
+
 
 @dataclass(frozen=True)
 class Gains:
@@ -357,13 +367,10 @@ def _share(
     tissues: Sequence[TissueKind], evidence: Sequence[float], logs: Sequence[float]
 ) -> dict[TissueKind, float]:
     """Log weights of the likeliest of tissues that differ in stiffness alone, with differences of evidence of
-    at most `TISSUES.doubt`, and together the weight of the likeliest."""
-    best = float(np.max(np.add(evidence, logs)))
+    at most `TISSUES.doubt`; `logs`: of their prior probabilities."""
     behind = np.subtract(evidence, max(evidence))
-    weight = np.add(-TISSUES.doubt * -np.expm1(behind / TISSUES.doubt), logs)
-    likeliest = np.argsort(-weight, kind="stable")[: TISSUES.shown]
-    shares = best + log_softmax(weight[likeliest])
-    return {tissues[k]: float(share) for k, share in zip(likeliest, shares, strict=True)}
+    weight = max(evidence) + TISSUES.doubt * np.expm1(behind / TISSUES.doubt) + np.array(logs)
+    return {tissues[k]: float(weight[k]) for k in np.argsort(-weight, kind="stable")[: TISSUES.shown]}
 
 
 def find_largest(candidates: Sequence[TissueKind], value: Callable[[TissueKind], float]) -> TissueKind:
@@ -414,8 +421,8 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
 def find_gains(
     scene: MethodContext, weights: TissueWeights, large: Sequence[tuple[Observation, SeenMotion]]
 ) -> Gains:
-    """Gains of frames with large motion, of rising slope, on the likeliest tissue; few of them are solved."""
-    tissue, radius = weights.tissues[0], np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
+    """Gains of frames with large motion, of rising slope, on the middle tissue; few of them are solved."""
+    tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     seen = touches_border(scene.tissue) <= TISSUES.cut
     opening_mm = min(float(radius), large_motion.OPEN_MM) if seen else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
