@@ -50,8 +50,8 @@ class TissueConstants:
     )
     stiffer: float = 1.0  # deviation of that stiffness' logarithm
     doubt: float = 2.0
-    """Largest difference of log evidence between stiffnesses: strong loads differ from the model's, and by
-    their evidence a membrane was softer by a factor of 3 to 20 than it was."""
+    """Largest difference of log evidence between stiffnesses, and between Poisson's ratios: strong loads
+    differ from the model's, and by their evidence a membrane is 3 to 20 times softer than it is."""
     shown: int = 3  # stiffnesses in a posterior, the likeliest
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
     cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
@@ -86,13 +86,15 @@ class TissueWeights:
 
     @property
     def middle(self) -> TissueKind:
-        """The tissue to solve large motion on: of those like the likeliest in all but stiffness the one
-        nearest to their mean, as the likeliest of them is hardly likelier than others."""
+        """The tissue to solve large motion on: of those with the likeliest edge and stretch the one whose
+        stiffness is nearest to their mean, as the likeliest of them is hardly likelier than others."""
         first = self.tissues[0]
-        alike = [k for k, one in enumerate(self.tissues) if replace(one, membrane=first.membrane) == first]
-        stiff = np.log([max(self.tissues[k].membrane, 1e-3) for k in alike])
-        mean = float(np.average(stiff, weights=self.weight[alike]))
-        return self.tissues[alike[int(np.abs(stiff - mean).argmin())]]
+        of = [
+            k for k, one in enumerate(self.tissues) if (one.edge, one.stretch) == (first.edge, first.stretch)
+        ]
+        stiff = np.log([max(self.tissues[k].membrane, 1e-3) for k in of])
+        mean = float(np.average(stiff, weights=self.weight[of]))
+        return self.tissues[of[int(np.abs(stiff - mean).argmin())]]
 
 
 @dataclass(frozen=True)
@@ -312,10 +314,11 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
 
 
 def _prior(tissues: Sequence[TissueKind], scene: MethodContext) -> Floats:
-    """Logarithm of each tissue's prior probability: log-normal in a membrane's stiffness, unless that is
-    stated."""
+    """Logarithm of each tissue's prior probability: log-normal in the stiffness of a membrane that is stated
+    to be intact, unless its stiffness is too."""
     stiff = np.array([tissue.membrane for tissue in tissues])
-    covered, spread = stiff > 0, TISSUES.stiffer if scene.membrane_mn_per_mm is None else np.inf
+    is_usual = scene.membrane == "intact" and scene.membrane_mn_per_mm is None
+    covered, spread = stiff > 0, TISSUES.stiffer if is_usual else np.inf
     stiffness = np.log(np.where(covered, stiff, 1.0) * (scene.young_kpa or UNKNOWN_YOUNG_KPA))
     density = -0.5 * np.square((stiffness - np.log(TISSUES.stiff_mn_per_mm)) / spread)
     share = {"intact": 1.0, "stripped": 0.0, "unknown": TISSUES.intact}[scene.membrane]
@@ -347,8 +350,10 @@ def weigh_tissues(
     for part in (False, True):
         if group := [each for each in candidates if (each.membrane > 0) is part]:
             best = find_largest(group, lambda tissue: evidence(tissue) + logs[tissue])
-            # The interval is to hold the most likely tissue with and without a membrane.
+            # Where it isn't known whether there is a membrane, the best with and without one are compared by
+            # their evidence: spread over stiffnesses, it would count for bare tissue too.
             alike = [each for each in group if replace(each, membrane=best.membrane) == best]
+            alike = alike if scene.membrane == "intact" else [best]
             score |= _share(alike, [evidence(each) for each in alike], [logs[each] for each in alike])
     best = max(score, key=lambda tissue: score[tissue])
     low, high = scene.poisson
@@ -356,7 +361,8 @@ def weigh_tissues(
     score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
     for nu in others:
         tissue = replace(best, poisson=nu)
-        score[tissue] = score[best] + evidence(tissue, posterior.load_basis_alone) - evidence(best)
+        more = evidence(tissue, posterior.load_basis_alone) - evidence(best)
+        score[tissue] = score[best] + TISSUES.doubt * np.tanh(more / TISSUES.doubt)
     weight = np.maximum(softmax(list(score.values())), TISSUES.unlikely)
     order = np.argsort(-weight, kind="stable")
     tissues = list(score)

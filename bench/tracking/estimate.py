@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from bench.methods import force_interval
-from bench.methods.method_interface import MethodContext
+from bench.methods.method_interface import ForceEstimate, MethodContext
 from bench.methods.physics import GRID, Physics
 from bench.tracking.contact_free import ContactFreeSearch
+from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.inference.video_motion import Motion, has_right_camera, motions, read_only, read_options
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
-from synth.arrays import Array
+from synth.arrays import Array, Floats, Ints, Mask
 from synth.errors import as_positive
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
@@ -82,6 +84,18 @@ def choose_input(source: Path | Array, given: str | None) -> str:
     return given or ("motion" if has_right_camera(source) else "recovered")
 
 
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What physics was given of T frames, and its estimates."""
+
+    index: Ints  # (T,) numbers in the video
+    time_s: Floats  # (T,), NaN without a clock
+    trusted: Mask  # (T,)
+    moved_mm: Floats  # (T,) mean length of the flow over the tissue
+    cameras: int
+    estimates: list[ForceEstimate]
+
+
 def apply_physics(
     motion: Motion,
     young_kpa: float | None = None,
@@ -92,68 +106,48 @@ def apply_physics(
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa` to `living`: as of `estimate`; `is_given`: whether tissue and instruments are.
-    Returns those of `learn.inference.prediction_file.FIELDS` that there are.
+    `young_kpa` to `living`: as of `estimate`; `is_given`: whether tissue and instruments are. Returns those
+    of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus or
+    stiffness.
     """
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
-    scale, by = motion.scale_mm_per_px, motion.recovered_by
-    if membrane_mn_per_mm is not None:
-        low, high = (as_positive("membrane_mn_per_mm", end) for end in membrane_mn_per_mm)
-        membrane_mn_per_mm = min(low, high), max(low, high)
-    scene = MethodContext(
-        motion.tissue,
-        scale,
-        young,
-        membrane,
-        living=living,
-        recovered_by=by,
-        membrane_mn_per_mm=membrane_mn_per_mm,
-    )
-    physics, free = Physics(), ContactFreeSearch(motion.tissue, scale)
-    rows, moved_mm, cameras = list[tuple[int, float, bool]](), list[float](), 1
-    for frame in motion.frames():
-        physics(frame, scene, False)
-        free.add(frame, frame.time_s or 0.0)
-        rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
-        lengths = np.linalg.norm(frame.flow[motion.tissue].astype(np.float64), axis=1)
-        moved_mm.append(scale * float(lengths.mean()))
-        cameras = 1 if frame.motion is None else 2
-    numbers, times, followed = map(np.array, zip(*rows, strict=True))
-    spans = free.find()
-    within = np.any(
-        [(times >= start) & (times <= end) for start, end in spans], axis=0
-    )  # False without spans
-    estimates = physics.revise(np.asarray(followed & within))
+    scale, by, stiff = motion.scale_mm_per_px, motion.recovered_by, membrane_mn_per_mm
+    if stiff is not None:
+        low, high = (as_positive("membrane_mn_per_mm", end) for end in stiff)
+        stiff = min(low, high), max(low, high)
+    about: dict[str, Any] = {"living": living, "recovered_by": by, "membrane_mn_per_mm": stiff}
+    scene, physics = MethodContext(motion.tissue, scale, young, membrane, **about), Physics()
+    found = _follow(motion, scene, physics)
     findings = problems([*judge_young(young), *motion.findings])
     fault = first_fault(findings)
-    trusted = followed & (not fault)
-    warnings = list(physics.warnings)
-    ends = np.full((len(rows), 2), np.nan)
+    trusted = found.trusted & (not fault)
+    ends, warnings = np.full((len(trusted), 2), np.nan), list(physics.warnings)
     if trusted.any():
-        known = [estimates[k] for k in np.flatnonzero(trusted)]
-        stated = float(np.mean([*is_given, membrane != "unknown", bool(spans) or not living]))
-        video = force_interval.gather(known, np.array(moved_mm)[trusted], cameras, stated)
+        known = [found.estimates[k] for k in np.flatnonzero(trusted)]
+        stated = float(np.mean([*is_given, membrane != "unknown", not living]))
+        video = force_interval.gather(known, found.moved_mm[trusted], found.cameras, stated)
         known, reason = force_interval.bound(known, video, 0.0, by)
         ends[trusted] = [(one.low_mn, one.high_mn) for one in known]
         warnings += [reason] if reason else []
+    # Pixel coordinates are of pixel centres: a picture begins at -0.5.
+    centre = motion.shrink * (np.array(physics.view.centre_px) + 0.5) - 0.5
     out: dict[str, Any] = {
         "density": physics.map_forces()[:, None],
-        "total_force_mn": np.where(trusted, [one.size_mn for one in estimates], np.nan),
-        "force_mn": np.where(trusted[:, None], [one.force_mn for one in estimates], np.nan),
+        "total_force_mn": np.where(trusted, [one.size_mn for one in found.estimates], np.nan),
+        "force_mn": np.where(trusted[:, None], [one.force_mn for one in found.estimates], np.nan),
         "trusted": trusted,
         "mask": physics.view.mask,
         "pitch_mm": GRID.pitch_mm,
         "scale_mm_per_px": scale / motion.shrink,
-        # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-        "centre_px": motion.shrink * (np.array(physics.view.centre_px) + 0.5) - 0.5,
-        "young_kpa": 1.0 if young is None else young,
+        "centre_px": centre,
+        "centres_px": np.tile(centre, (len(trusted), 1)),
+        "young_kpa": UNKNOWN_YOUNG_KPA if young is None else young,
         "young_known": young is not None,
-        "frame": numbers,
+        "frame": found.index,
     }
-    out["centres_px"] = np.tile(out["centre_px"], (len(rows), 1))
-    if np.isfinite(times).any():
-        out["time_s"] = times
+    if np.isfinite(found.time_s).any():
+        out["time_s"] = found.time_s
     if np.isfinite(ends).any():
         out |= {"low_mn": ends[:, 0], "high_mn": ends[:, 1], "level": np.array([LEVEL])}
     notes = [finding.message for finding in findings if finding.severity == "warning"]
@@ -164,3 +158,21 @@ def apply_physics(
         notes.append(f"{(~trusted).sum()} of {len(trusted)} frames could not be followed: they have no force")
     out["notes"] = np.array(notes, dtype=str)
     return out
+
+
+def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> Followed:
+    """Applies physics to every frame, and again to all once spans without contact are known."""
+    free, cameras = ContactFreeSearch(motion.tissue, scene.scale_mm_per_px), 1
+    rows = list[tuple[int, float, bool, float]]()
+    for frame in motion.frames():
+        physics(frame, scene, False)
+        free.add(frame, frame.time_s or 0.0)
+        time_s = math.nan if frame.time_s is None else frame.time_s
+        lengths = np.linalg.norm(frame.flow[motion.tissue].astype(np.float64), axis=1)
+        rows.append((frame.index, time_s, frame.trusted, scene.scale_mm_per_px * float(lengths.mean())))
+        cameras = 1 if frame.motion is None else 2
+    index, times, trusted, moved_mm = map(np.array, zip(*rows, strict=True))
+    # False without spans.
+    inside = np.any([(times >= start) & (times <= end) for start, end in free.find()], axis=0)
+    estimates = physics.revise(np.asarray(trusted & inside))
+    return Followed(index, times, trusted, moved_mm, cameras, estimates)
