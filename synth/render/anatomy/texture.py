@@ -74,7 +74,7 @@ class Artery:
     absorption_per_mm: Rgb = (0.42, 4.25, 6.0)
     rosy: Rgb = (0.9, 4.4, 4.6)  # that of wide ones and of some stretches, under more of the arachnoid
     rosy_share: tuple[float, float, float] = 0.1, 0.55, 0.3  # of it: of fine ones, of wide ones more, spread
-    opaque: tuple[float, float] = 0.29, 0.1  # depth that even fine ones reach, and the chord for 63% of it
+    opaque: tuple[float, float] = 0.29, 0.08  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.72, 0.22, 0.165)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
