@@ -81,4 +81,4 @@ def _finer(layer: Map, interpolation: int) -> Map:
 def _distances(a: Floats, b: Floats) -> Floats:
     """Distances (N, M) of features (N, d) and (M, d)."""
     square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.sqrt(np.maximum(square, 0))
+    return np.asarray(np.sqrt(np.maximum(square, 0)))
