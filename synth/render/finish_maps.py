@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from synth.arrays import Floats, Indices, Map
-from synth.render.anatomy.layers import over, ridge, step, through
+from synth.render.anatomy.layers import Rgb, over, ridge, step, through
 from synth.render.finish import Finish
 from synth.render.idle import CLOTH
 from synth.render.materials import FinishMaps
@@ -36,7 +36,14 @@ _GLINTS = (0.1, 0.10, 0.42), (-0.62, 0.05, 0.10), (0.9, 0.05, 0.12)  # on a coat
 _BANDS = (0.46, 0.18, 0.45), (-0.4, 0.2, 0.5), (0.98, 0.08, 0.3), (-0.98, 0.08, 0.3)  # dark ones on steel
 _CREST = 0.05, 0.08, 0.5  # its bright one: place across, width, share of it that scatters
 _COLLAR_MM = 0.9, 0.13  # length of the collar in which a coat begins, and width of the grooves beside it
-_WEAVE_MM = 0.45  # between the fibres of felt
+_WEAVE_MM = 0.42  # between the threads of a patty,
+_WOVEN = 0.4, 0.04  # light that the gaps between them take, and their depth, mm
+_HEM = 0.5, 0.45, 0.12  # width of a patty's rounded border, mm, light that it lacks, and its fall, mm
+_DRUNK = 0.45  # depth of blood that cloth takes up
+_SOAKED = 0.3, 1.6  # optical depth of thinned blood in a patty, and by how much it falls over its half width
+_WINDOW = 0.34, 0.66, 0.5  # of a clip: its start and end along it, and how far across it reaches
+_FLESH: tuple[Rgb, ...] = (0.40, 0.07, 0.04), (0.72, 0.50, 0.20), (0.66, 0.44, 0.36)  # muscle, fat, fascia
+_FOLDED = "clip", "fold"  # kinds that show the cut edge of skin
 _XRAY = np.array((0.03, 0.10, 0.28), np.float32)  # albedo of a patty's thread
 _STREAKS = 1.3, 0.16  # of blood along a shaft: wavelength across it, mm, as a share of that along it
 _BROAD_MM = 1.2  # half the width of a shaft from which on they are wider
@@ -210,10 +217,12 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     scratch = step(lines - 1.6) * step(1.2 * mottle + 0.3)
     pale = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
     painted = np.asarray(finish.coat, np.float32) * pale + _CHALK * (handled + scratch)[..., None]
-    if not kind.startswith(("finger", "string", *CLOTH)):
+    if not kind.startswith(("finger", "string", "fold", *CLOTH)):
         painted, bumps = _moulded(finish, texels, handled, painted, bumps)
     if kind == "patty":
-        painted, bumps = _felted(texels, painted, bumps)
+        painted, bumps = _woven(texels, painted, bumps)
+    if kind in _FOLDED:
+        painted, bumps = _fleshed(texels, painted, bumps)
     base = over(base, painted, coat[..., None])
     glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
     rough = over(rough, glossy * (1 + _DULLED * handled[..., None]), coat[..., None])
@@ -244,13 +253,39 @@ def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps:
     return np.asarray(painted, np.float32), bumps
 
 
-def _felted(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
-    """Albedo and bumps of pressed cotton: its fibres, and the thread that shows in X-rays."""
+def _woven(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
+    """Albedo and bumps of a pad of cotton that soaks up fluid from its border: its threads, over and under
+    each other, its rounded border, and the thread that shows in X-rays."""
     along, aside, _ = np.moveaxis(texels.place, -1, 0)
-    fibre = np.cos(2 * np.pi / _WEAVE_MM * (along + 0.3 * texels.mottle)) + 0.7 * texels.grain
-    thread = step((0.13 - np.abs(aside + 0.03 * texels.mottle)) / 0.08)[..., None]
-    felt = painted * (0.85 + 0.07 * fibre + 0.06 * texels.blotch)[..., None]
-    return over(felt, _XRAY, thread), bumps + 0.02 * fibre
+    u, v = ((way + 0.04 * texels.mottle + 0.012 * texels.grain) / _WEAVE_MM for way in (along, aside))
+    above = np.mod(np.floor(u) + np.floor(v), 2) == 0
+    thread = np.where(above, np.sin(np.pi * u) ** 2, np.sin(np.pi * v) ** 2) * (0.8 + 0.2 * texels.grain)
+    dark, deep = _WOVEN
+    wide, lost, fall = _HEM
+    hem = np.clip(1 - (texels.along + 0.08 * texels.mottle) / wide, 0, 1) ** 2
+    cloth = painted * ((1 - dark * (1 - thread) + 0.05 * texels.blotch) * (1 - lost * hem))[..., None]
+    inwards = np.clip(texels.along / max(texels.half_mm, 0.1), 0, 1)
+    most, falls = _SOAKED
+    soaked = most * np.exp(-falls * inwards) * np.clip(1 + 0.5 * texels.blotch + 0.25 * texels.mottle, 0, 2)
+    cloth = through(cloth, soaked, _FILM)
+    xray = step((0.11 - np.abs(aside + 0.03 * texels.mottle)) / 0.08) * (0.55 + 0.4 * thread)
+    return over(cloth, _XRAY, xray[..., None]), bumps + deep * thread - fall * hem
+
+
+def _fleshed(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
+    """Albedo and bumps of a fold of cut skin: all of it, or what a clip's window shows of it."""
+    share = np.ones_like(texels.along)
+    if texels.kind == "clip":
+        start, end, reach = _WINDOW
+        part = texels.along / texels.along.max()
+        share = step((part - start) / 0.03) * step((end - part) / 0.03) * step((reach - texels.across) / 0.06)
+    muscle, fat, fascia = (np.array(colour, np.float32) for colour in _FLESH)
+    flesh = muscle * (1 + 0.15 * texels.mottle + 0.06 * texels.grain)[..., None]
+    flesh = over(flesh, fat, (0.8 * step((0.6 * texels.blotch + 0.4 * texels.mottle - 0.5) / 0.6))[..., None])
+    flesh = over(flesh, fascia, (0.6 * step((texels.mottle - 0.7 * texels.blotch - 0.8) / 0.5))[..., None])
+    edge = share * (1 - share) * 4
+    relief = (0.012 * texels.mottle + 0.004 * texels.grain) * share - 0.25 * (texels.kind == "clip") * share
+    return over(painted, flesh, share[..., None]) * (1 - 0.6 * edge)[..., None], bumps + relief
 
 
 def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map]:
@@ -290,7 +325,10 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     level, reach, thin = _SMEARED
     wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
     deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
-    film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5)
+    # In cloth blood is soaked up, and its threads show.
+    film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5) * (not texels.sheet)
+    if texels.sheet:
+        deep = np.clip(deep * (0.6 + 0.3 * texels.mottle), 0, _DRUNK)
     edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
     smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]
     return _Layers(

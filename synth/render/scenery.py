@@ -32,8 +32,10 @@ _WIRE = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood_mm=4
 _CLIP_MM = 3.4, 2.1  # length along the skin's edge and radius
 _GROUPS, _TOGETHER = (3, 6), (2, 4)  # clips: numbers of groups, and in each
 _GAP_MM, _BEHIND_MM = 1.2, 0.5  # between two, and from the skin's edge
+_FOLD = 0.86, 26, 0.1  # of skin that they grip: radius as a share of theirs, its rings, and its unevenness
+_FLESH = Finish((0.5, 0.5, 0.5), 0.3, coat=(0.4, 0.07, 0.04), coat_alpha=0.25, bare_mm=-1.0)
 _MARGIN = 0.15  # of the picture, outside which an object is left out
-_COLOURS = (0.012, 0.035, 0.26), (0.012, 0.035, 0.26), (0.03, 0.10, 0.34), (0.6, 0.62, 0.64)  # blues, white
+_COLOURS = (0.008, 0.014, 0.16), (0.008, 0.014, 0.16), (0.02, 0.06, 0.28), (0.6, 0.62, 0.64)  # blues, white
 _HOOKS, _HOOK_MM = (2, 5), 0.36  # their number, and the radius of their wire
 _PATTIES, _PATTY_MM = (1, 4), (2.2, 3.6)  # their number, and half their length
 _INSIDE_MM = 0.4, 1.3  # by which a patty reaches over the opening's edge
@@ -73,10 +75,11 @@ def build_clips(
     count, first = int(rng.integers(*_GROUPS)), rng.uniform(0, 2 * np.pi)
     for group in range(count):
         turn = first + 2 * np.pi * group / count + rng.normal(0, 0.25)
+        middles = list[Floats]()
         for _ in range(rng.integers(*_TOGETHER)):
             away = scale * (_behind(rim, rim.skin, turn) + _BEHIND_MM)
             turn += (_CLIP_MM[0] + _GAP_MM) / away
-            skew, blood = float(rng.normal(0, 0.12)), float(rng.uniform(0.02, 0.3))
+            skew, blood = float(rng.normal(0, 0.12)), float(rng.uniform(0.0, 0.14))
             middle = _rest(ground, away * _outwards(turn), 0.1 * _CLIP_MM[1])
             # On the highest of what it would cut into.
             below = ground[np.hypot(*(ground - middle)[:, :2].T) < _CLIP_MM[1]]
@@ -88,9 +91,12 @@ def build_clips(
             part = _clip()
             s = part.profile[::RING, 2] / _CLIP_MM[0]
             skin = Finish(
-                (0.6, 0.6, 0.6), 0.3, coat=colour, coat_alpha=0.16, bare_mm=-1.0, blood=blood, blood_mm=6.0
+                (0.6, 0.6, 0.6), 0.3, coat=colour, coat_alpha=0.26, bare_mm=-1.0, blood=blood, blood_mm=6.0
             )
             bars.append(Bar(part, 16, middle + (s[:, None] - 0.5) * along, skin, "clip"))
+            middles.append(middle)
+        if middles:
+            bars.append(_fold(np.array(middles), ground, rng))
     return _bodies(bars, theatre, rng, 1.5 * camera.mm_per_px)
 
 
@@ -138,7 +144,7 @@ def build_patties(
         cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
         part = instrument.lay_cloth(cloth, ground, rng)
         (vertices,) = instrument.place([part], *cloth.at(0.0))
-        soaked = float(rng.uniform(0.05, 0.38))
+        soaked = float(rng.uniform(0.0, 0.22))
         felt = replace(draw_finish(0.0, rng, "patty"), blood=soaked, blood_mm=0.6 * half)
         maps = part.maps(felt, "patty", rng, camera.mm_per_px)
         sheet = Shape(vertices, part.shape.faces)
@@ -240,6 +246,25 @@ def wire(path: Floats, radius: float) -> Part:
     r = np.full(len(s), radius)
     r[[0, -1]] *= 0.05
     return Part(instrument.sweep(s, r, r, np.zeros_like(s), 1.0), 0)
+
+
+def _fold(middles: Floats, ground: Floats, rng: np.random.Generator) -> Bar:
+    """The fold of cut skin that clips at `middles` (n, 3) mm, along a line, grip: it sinks in beyond them."""
+    share, rings, uneven = _FOLD
+    ahead = middles[-1] - middles[0] if len(middles) > 1 else np.cross([0.0, 0.0, 1.0], middles[0])
+    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    ends = [middles[k] + side * 1.1 * _CLIP_MM[0] * ahead for k, side in ((0, -1), (-1, 1))]
+    stops = np.array([ends[0], *middles, ends[1]])
+    for end in (0, -1):
+        stops[end] = _rest(ground, stops[end], -0.9 * _CLIP_MM[1])
+    run = np.append(0, np.linalg.norm(np.diff(stops, axis=0), axis=1).cumsum())
+    s = np.linspace(0, run[-1], rings)
+    path = gaussian_filter1d(np.stack([np.interp(s, run, axis) for axis in stops.T], axis=1), 1.0, axis=0)
+    wave = gaussian_filter1d(rng.standard_normal(rings), 1.5)
+    r = share * _CLIP_MM[1] * np.clip(1 + uneven * wave / max(float(wave.std()), 1e-9), 0.7, 1.12)
+    r[[0, -1]] *= 0.05
+    flesh = replace(_FLESH, blood=float(rng.uniform(0.1, 0.5)), blood_mm=float(run[-1]))
+    return Bar(Part(instrument.sweep(s, r, r, np.zeros_like(s), 0.9), 0), 16, path, flesh, "fold")
 
 
 def _clip() -> Part:

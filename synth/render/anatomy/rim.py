@@ -130,7 +130,7 @@ class Skin:
     away: tuple[float, float] = 3.4, 1.4  # behind the wall's foot: mean and spread,
     clipped: tuple[float, float] = 1.6, 0.5  # where clips hold it,
     boned: float = 2.6  # and by how much farther behind bone
-    albedo: Rgb = (0.70, 0.46, 0.33)
+    albedo: Rgb = (0.78, 0.57, 0.42)
     fat: Rgb = (0.82, 0.60, 0.36)  # in lobules
     dermis: Rgb = (0.80, 0.56, 0.46)
     width: tuple[float, float] = 0.9, 0.3  # of the fat, and of the dermis over it
@@ -444,7 +444,7 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
     )
     dry = np.clip(
-        0.3 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.6 * tight - 0.9 * wet - 0.3 * inner,
+        0.3 + 0.3 * (wide + outer) - 0.7 * soaked - 0.5 * gutter + 0.45 * tight - 0.9 * wet - 0.3 * inner,
         0.02,
         1,
     )
@@ -553,7 +553,7 @@ def _with_skin(
     yellow = through(speckled(Skin.fat, 0.16 * grain, 0.06 * mottle), soaked, Skin.stain)
     colour = over(colour, yellow, fat[..., None])
     colour = over(colour, speckled(Skin.dermis, 0.06 * mottle, 0.04 * fine), 0.8 * dermis[..., None])
-    pale = speckled(Skin.albedo, 0.05 * mottle, 0.04 * grain, 0.07 * fine)
+    pale = speckled(Skin.albedo, 0.05 * mottle, 0.02 * grain, 0.015 * fine)
     stained = wiped + np.clip(blood * (1.4 - 0.7 * place) + 0.35 * mottle, 0, 1.2)
     pore = step((grain - 1.9) / 0.4)
     pale = through(pale, stained + 0.35 * pore, Wound.blood)

@@ -71,9 +71,11 @@ class Bleeding:
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
-    absorption_per_mm: Rgb = (0.2, 4.4, 6.5)
-    opaque: tuple[float, float] = 0.28, 0.065  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.86, 0.22, 0.11)  # albedo
+    absorption_per_mm: Rgb = (0.42, 4.25, 6.0)
+    rosy: Rgb = (0.9, 4.4, 4.6)  # that of wide ones and of some stretches, under more of the arachnoid
+    rosy_share: tuple[float, float, float] = 0.1, 0.55, 0.3  # of it: of fine ones, of wide ones more, spread
+    opaque: tuple[float, float] = 0.29, 0.08  # depth that even fine ones reach, and the chord for 63% of it
+    wall: Rgb = (0.72, 0.22, 0.165)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
@@ -87,18 +89,23 @@ class Vein:
     thin: Rgb = (0.42, 0.11, 0.14)  # albedo
     wide: tuple[float, float] = 0.12, 0.3  # radius at which a vein begins to be thick, span to fully thick
     margin: float = 0.8  # blur
-    margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
+    margin_dark: Rgb = (0.36, 0.85, 0.62)  # absorption
     crest: float = 0.5  # of a thick one's radius: width of its bluish crest
     rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
     rim_dark: Rgb = (0.8, 1.15, 0.85)  # absorption
     mottle: float = 0.14  # standard deviation of its wall's albedo, as a share of it
+    fibres: tuple[float, float] = 0.5, 0.045  # of its wall: wavelength, and contrast
+    veil: Rgb = (0.60, 0.47, 0.42)  # albedo of the arachnoid over it,
+    veiled: tuple[float, float, float] = 0.08, 0.12, 0.4  # share of it that shows: mean, spread, most
+    deep: tuple[float, float] = 0.4, 0.4  # by how much less of it shows where it lies deeper; the least share
     sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
     shoulder: float = 0.14  # blur of its relief
     level: float = 0.97  # share by which a crest turns from the pia's slope to that which mirrors the lamp:
     # nearly all, so that the highlight never ends; the wall's long waves vary its width
-    dry: tuple[float, float] = 0.7, 0.25  # share of a thick one's crest under a thin film: mean, and spread
-    waves: float = 0.016  # standard deviation of the slopes of its wall's waves
-    waves_mm: float = 0.3  # blur that makes them
+    dry: tuple[float, float] = 0.8, 0.2  # share of a thick one's crest under a thin film: mean, and spread
+    beside: tuple[float, float] = 0.85, 0.4  # that of the pia beside a thick one, and blur of where
+    waves: float = 0.027  # standard deviation of the slopes of its wall's waves
+    waves_mm: float = 0.16  # blur that makes them
 
 
 class Film:
@@ -112,8 +119,8 @@ class Film:
     rough: float = 0.05  # standard deviation of slopes where the film is thin
     level: float = 0.15  # share of the pia's slope that a pool takes away,
     filled: float = 0.6  # and of the relief under it
-    ripples: float = 0.065  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
-    ripples_mm: float = 0.19  # blur that makes them
+    ripples: float = 0.045  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
+    ripples_mm: float = 0.3  # blur that makes them
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
@@ -200,11 +207,11 @@ def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, exte
 
 
 def _paint_rows(appearance: Appearance, *maps: Map) -> tuple[Map]:
-    """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 5 of veins, 3 of arteries."""
+    """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 6 of veins, 3 of arteries."""
     tissue = _with_clefts(appearance, _parenchyma(appearance, *maps[:6]), sulci=maps[2], strands=maps[6])
-    veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:13])
+    veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:14])
     crossed = maps[9] * step((0.85 - maps[8]) / 0.3)  # wide veins, over which arteries run
-    return (_with_arteries(appearance, veined, crossed, *maps[13:]),)
+    return (_with_arteries(appearance, veined, crossed, *maps[14:]),)
 
 
 def _parenchyma(
@@ -282,23 +289,28 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     thick = np.clip((radius - start) / span, 0, 1)
     mottled = 0.8 * noise.band(rng, 96, extent, 9.0, 0.6) + 0.6 * noise.band(rng, 96, extent, 2.4, 0.5)
     along = cv2.resize(mottled, size)
+    fibres = cv2.resize(noise.band(rng, 384, extent, Vein.fibres[0], 0.5), size)
     cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.09, extent)
     margin = noise.blur(((across < 1) * thick).astype(np.float32), Vein.margin, extent)
-    return [across, thick, along, cover, margin]
+    return [across, thick, along, fibres, cover, margin]
 
 
 def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their veins, by the maps of `_vein_maps`."""
-    across, thick, along, cover, margin = maps
+    across, thick, along, fibres, cover, margin = maps
     crest = (np.clip(0.6 + 0.3 * along, 0.1, 1) * thick * ridge(across, width=Vein.crest))[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
     middle, width = Vein.rim
-    wall = wall * (1 + Vein.mottle * along)[..., None]
+    wall = wall * (1 + Vein.mottle * along + Vein.fibres[1] * fibres)[..., None]
     wall = through(wall, thick * ridge(across, width=width, at=middle), Vein.rim_dark)
-    # Some stretches lie deeper, under the arachnoid.
-    cover = (cover * np.clip(0.95 + 0.25 * np.minimum(along + 0.6, 0), 0.55, 0.97))[..., None]
+    # Some stretches lie deeper, under the arachnoid, which is milky in places.
+    mean, spread, most = Vein.veiled
+    milky = np.clip(mean - spread * along + 0.02 * fibres, 0, most) * thick
+    wall = over(wall, np.array(Vein.veil, np.float32), milky[..., None])
+    less, least = Vein.deep
+    cover = (cover * np.clip(0.95 + less * np.minimum(along + 0.5, 0), least, 0.97))[..., None]
     return np.asarray(over(through(albedo, 1.7 * margin, Vein.margin_dark), wall, cover), np.float32)
 
 
@@ -312,12 +324,16 @@ def _with_arteries(
     reach = most * (1 - np.exp(-chord / soon)) + 0.08 * chord
     mean, spread = Artery.covered
     fade = np.clip(mean + spread * wide, 0.35, 1.2)
-    red = through(albedo, appearance.arterial_absorption * reach * fade, Artery.absorption_per_mm)
     # The wall of a wide artery scatters light itself, most along the crest.
     start, span = Artery.wide
     thick = np.maximum(np.clip((radius - start) / span, 0, 1), Artery.crossing * crossed) * (
         distance < radius
     )
+    fine, more, uneven = Artery.rosy_share
+    rosy = np.clip(fine + more * thick - uneven * wide, 0, 1)[..., None]
+    orange, rose = (np.array(blood, np.float32) for blood in (Artery.absorption_per_mm, Artery.rosy))
+    depth = (appearance.arterial_absorption * reach * fade)[..., None]
+    red = albedo * np.exp(-depth * (orange + rosy * (rose - orange)))
     across = distance / np.maximum(radius, 1e-3)
     wall = np.array(Artery.wall, np.float32) * (0.7 + 0.4 * ridge(across, width=0.55))[..., None]
     walled = red + (0.55 * thick * np.clip(fade, 0, 1))[..., None] * (wall - red)
@@ -337,10 +353,10 @@ def _film(
     relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
     relief = noise.blur(relief, appearance.fluid_smoothing_mm, extent)
     uneven = noise.fractal(rng, coarse, extent, 5.0, 1.5)
-    # Fluid lies in pools, in sulci and along vessels; elsewhere the film mirrors next to nothing.
-    blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
+    # Fluid lies in pools, in sulci and along arteries; elsewhere the film mirrors next to nothing.
+    blood = thickness(tubes["arteries"])
     around = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
-    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 2.4 * np.minimum(around, 0.25)
+    wet = 0.7 * cv2.resize(sulci, (coarse, coarse)) + 2.4 * np.minimum(around, 0.25)
     wet = wet + 1.6 * appearance.light.glare
     if shade is not None:
         edge = cv2.resize(1 - shade, (coarse, coarse), interpolation=cv2.INTER_AREA)
@@ -371,6 +387,9 @@ def _film(
     bare, wide = (
         cv2.resize(share, (coarse, coarse), interpolation=cv2.INTER_AREA) for share in (on_vein, wide)
     )
+    # Beside wide veins it would shine in beads where the wall meets the pia.
+    most, reach = Vein.beside
+    dry = np.maximum(dry, most * np.clip(4 * noise.blur(wide, reach, extent), 0, 1))
     mean, spread = Vein.dry
     dry = over(dry, np.clip(mean + spread * noise.band(rng, coarse, extent, 3.0, 0.6), 0.1, 1), bare)
     return np.asarray(height, np.float32), np.asarray(np.clip(dry, 0, 1), np.float32), pools, wide

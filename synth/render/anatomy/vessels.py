@@ -73,22 +73,23 @@ TRIBUTARIES = (
     Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=2.4, reach=10.0, near=0.9, step=0.18, straight=1.4, end=(0.066, 0.088)),
-    Growth(spacing=1.05, reach=4.0, near=0.33, step=0.14, straight=1.3, end=(0.05, 0.062)),
-    Growth(spacing=0.62, reach=2.5, near=0.17, step=0.12, straight=1.2, end=(0.036, 0.047)),
-    Growth(spacing=0.45, reach=1.5, near=0.15, step=0.1, straight=1.1, end=(0.026, 0.033)),
+    Growth(spacing=3.2, reach=12.0, near=0.9, step=0.22, straight=3.0, end=(0.03, 0.04)),
+    Growth(spacing=1.5, reach=5.0, near=0.45, step=0.16, straight=2.4, end=(0.03, 0.036)),
+    Growth(spacing=0.88, reach=2.5, near=0.24, step=0.12, straight=1.8, end=(0.027, 0.033)),
+    Growth(spacing=0.5, reach=1.5, near=0.16, step=0.1, straight=1.4, end=(0.025, 0.033)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.22  # radius of such a vein
-_TWIG_MM = 0.25  # shorter side branches are left out: they look like thorns
-_ROUNDED = 10  # rounds of smoothing of what has grown in, over some 0.2 mm
-_THIN_MM = 6.0  # length over which trunks thin to where branches go on
+_TWIG_MM = 0.25  # shorter side branches are left out: they look like thorns,
+_TWIG_RADII = 5.0  # the more so, the wider what they leave
+_ROUNDED = 11  # rounds of smoothing of what has grown in, over some 0.2 mm: more straighten twigs
+_THIN_MM = 3.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.5  # length over which arterioles and tributaries thin
 _POINTED = 0.026, 0.06  # radius of a free end, and by how much it grows with each mm from there
 _ENDS_MM, _ENDS = (0.0, 0.55, 1.1, 1.8), (0.018, 0.028, 0.056, 0.2)  # most radius before a free end
 _WIDENS = 1.08  # times, at most and besides, from a node to the next one up
-_WINDING = 0.18, 1.3  # shift of fine vessels, and over what distance
+_WINDING = 0.15, 1.9  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
 _WIDEST_MM = 0.5  # radius that no artery of the pia reaches, whatever its branches sum up to
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
@@ -186,15 +187,16 @@ def _narrow(tree: Tree) -> Tree:
 
 
 def _without_thorns(tree: Tree) -> Tree:
-    """The tree without side branches shorter than `_TWIG_MM`."""
+    """The tree without side branches that are short, most of all beside the trunk that they leave."""
     left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
     left = left + np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
+    least = _TWIG_MM + _TWIG_RADII * tree.radius[tree.parent]
     longest = np.zeros(len(left))
     child = np.flatnonzero(tree.parent >= 0)
     np.maximum.at(longest, tree.parent[child], left[child])
-    gone = (tree.parent >= 0) & (left < _TWIG_MM) & (left < longest[tree.parent])
-    for _ in range(round(_TWIG_MM / 0.05)):
-        gone |= gone[tree.parent] & (tree.parent >= 0)
+    gone = (tree.parent >= 0) & (left < least) & (left < longest[tree.parent])
+    while (beyond := gone[tree.parent] & (tree.parent >= 0) & ~gone).any():
+        gone |= beyond
     return _parts(tree, ~gone)
 
 

@@ -47,9 +47,9 @@ class Ranges:
     `evidence.appearance` compares renderings with one.
     """
 
-    gyrus_albedo: Colour = (0.95, 0.765, 0.49)
+    gyrus_albedo: Colour = (0.95, 0.765, 0.53)
     perfused_albedo: Colour = (0.95, 0.61, 0.41)
-    vein_crest_albedo: Colour = (0.31, 0.27, 0.345)
+    vein_crest_albedo: Colour = (0.31, 0.255, 0.31)
     vein_side_albedo: Colour = (0.23, 0.07, 0.085)
     arterial_absorption: Ends = (1.1, 1.5)
     subpial_absorbance_per_mm: Ends = (1.4, 2.2)
