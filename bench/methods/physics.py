@@ -45,9 +45,8 @@ class TissueConstants:
     membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
     intact: float = 0.33  # prior probability of a membrane
-    stiff_mn_per_mm: float = (
-        50.0  # median of its stiffness: 0.05 to 0.2 mm of 100 to 1000 kPa (MembraneSection)
-    )
+    stiff_mn_per_mm: float = 35.0
+    """Median of its stiffness: 0.05 to 0.2 mm of 100 to 1000 kPa (`MembraneSection`)."""
     stiffer: float = 1.0  # deviation of that stiffness' logarithm
     doubt: float = 2.0
     """Largest difference of log evidence between stiffnesses, and between Poisson's ratios: strong loads
@@ -86,15 +85,16 @@ class TissueWeights:
 
     @property
     def middle(self) -> TissueKind:
-        """The tissue to solve large motion on: of those with the likeliest edge and stretch the one whose
-        stiffness is nearest to their mean, as the likeliest of them is hardly likelier than others."""
+        """The tissue to solve large motion on: the likeliest, with the geometric mean stiffness of those of
+        its edge and stretch, as the likeliest stiffness is hardly likelier than others."""
         first = self.tissues[0]
+        if first.membrane == 0:
+            return first
         of = [
             k for k, one in enumerate(self.tissues) if (one.edge, one.stretch) == (first.edge, first.stretch)
         ]
-        stiff = np.log([max(self.tissues[k].membrane, 1e-3) for k in of])
-        mean = float(np.average(stiff, weights=self.weight[of]))
-        return self.tissues[of[int(np.abs(stiff - mean).argmin())]]
+        logs = np.log([self.tissues[k].membrane for k in of])
+        return replace(first, membrane=float(f"{np.exp(np.average(logs, weights=self.weight[of])):.3g}"))
 
 
 @dataclass(frozen=True)
@@ -362,7 +362,9 @@ def weigh_tissues(
     for nu in others:
         tissue = replace(best, poisson=nu)
         more = evidence(tissue, posterior.load_basis_alone) - evidence(best)
-        score[tissue] = score[best] + TISSUES.doubt * np.tanh(more / TISSUES.doubt)
+        # As evidence between stiffnesses: a ratio that fits must not bring its one stiffness alone.
+        more = TISSUES.doubt * np.tanh(more / TISSUES.doubt) if scene.membrane == "intact" else more
+        score[tissue] = score[best] + more
     weight = np.maximum(softmax(list(score.values())), TISSUES.unlikely)
     order = np.argsort(-weight, kind="stable")
     tissues = list(score)
