@@ -55,7 +55,7 @@ def test_rendering_a_frame() -> None:
     assert found["largest_motion_mm"] == pytest.approx(1.528, rel=1e-2)
     assert found["largest_flow_px"] == pytest.approx(7.311, rel=1e-2)
     assert frame.rgb.shape == (240, 320, 3)
-    assert frame.rgb[100:140, 140:180].mean() == pytest.approx(180.2, abs=3)
+    assert frame.rgb[100:140, 140:180].mean() == pytest.approx(184.2, abs=3)
     half = render_frame.push(0.15)
     assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
