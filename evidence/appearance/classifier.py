@@ -152,13 +152,11 @@ def measure(
     lengths = np.stack(
         [vessel_lengths(crop, np.ones(crop.shape[:2], bool), MM_PER_PX)[0] for crop in pictures]
     )
-    rich = np.flatnonzero(lengths.sum(axis=1) >= _VESSELS)
-    kept = [np.asarray(of[rich], np.int64) for of in (label, fold)]
-    pairs = np.asarray(both[np.ix_(rich, rich)], bool)
-    add("default job, of vessels", features[""][rich], kept[0], kept[1], pairs)
+    rich = lengths.sum(axis=1) >= _VESSELS
+    add("default job, of vessels", features[""][rich], label[rich], fold[rich], both[np.ix_(rich, rich)])
     if job:
-        others, *labels = against(changed(as_job(job), {"sequences": frames, "seed": seed}))
-        add(job, embedded(others), labels[0], labels[1], labels[2])
+        others, of, place, beside = against(changed(as_job(job), {"sequences": frames, "seed": seed}))
+        add(job, embedded(others), of, place, beside)
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", features[""], shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
