@@ -155,8 +155,8 @@ def measure(
     rich = lengths.sum(axis=1) >= _VESSELS
     add("default job, of vessels", features[""][rich], label[rich], fold[rich], both[np.ix_(rich, rich)])
     if job:
-        others, of, place, beside = against(changed(as_job(job), {"sequences": frames, "seed": seed}))
-        add(job, embedded(others), of, place, beside)
+        others, kind, place, beside = against(changed(as_job(job), {"sequences": frames, "seed": seed}))
+        add(job, embedded(others), kind, place, beside)
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", features[""], shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
