@@ -325,7 +325,7 @@ def _prior(tissues: Sequence[TissueKind], scene: MethodContext) -> Floats:
     out = np.full(len(tissues), -np.inf)
     for part, weight in ((covered, share), (~covered, 1 - share)):
         if part.any() and weight > 0:
-            out[part] = np.log(weight) + log_softmax(np.where(part, density, -np.inf)[part])
+            out[part] = np.log(weight) + log_softmax(density[part])
     return out
 
 
