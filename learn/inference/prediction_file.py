@@ -42,7 +42,12 @@ FIELDS: dict[str, PredictedField] = {
     "time_s": PredictedField("T", "s", "on the video's clock; absent without one"),
     "trusted": PredictedField("T", "-", "whether the frame could be followed"),
     "total_force_mn": PredictedField("T", "mN", "size of the total force on the tissue; NaN if not trusted"),
-    "force_mn": PredictedField("T, 3", "mN", "the same by x right, y down, z away; of a vector model"),
+    "force_mn": PredictedField(
+        "T, 3",
+        "mN",
+        "the force by x right, y down, z away, of a vector model; by physics with one camera it is shorter "
+        "than the size, which counts what isn't seen",
+    ),
     "density": PredictedField("T, C, N, N", "mN/mm²", "on the grid, nothing subtracted: size or x, y, z"),
     "low_mn": PredictedField("T", "mN", "lower end of the size's 90% interval; these six if fitted"),
     "high_mn": PredictedField("T", "mN", "upper end of the size's 90% interval"),
