@@ -244,7 +244,7 @@ PROBES: Mapping[str, Probe] = {
     "truth": Probe(probe_truth, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
     "flow": Probe(probe_flow, 1e-2, ("MOTION",), ("synth/flow",)),
     "stereo": Probe(probe_stereo, 1e-2, ("MOTION",), ("synth/flow/stereo",)),
-    "network": Probe(probe_network, 1e-2, ("TRAINING", "CLIPS"), ("learn",)),
+    "network": Probe(probe_network, 1e-2, ("TRAINING", "CLIPS"), ("learn", "synth/flow/onnx_network")),
     "compliance": Probe(probe_compliance, 1e-3, ("COMPLIANCE", "MESH"), ("bench/methods",)),
     "score": Probe(
         probe_score,
