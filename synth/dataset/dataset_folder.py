@@ -270,9 +270,12 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     if not root.is_dir():
         raise UserError(f"{root}: is a file; choose a folder")
     if not (root / _NAME).exists():
-        if others := sorted(entry.name for entry in root.iterdir() if not entry.name.startswith(".")):
-            raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
-        return
+        others = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
+        # Another part may have begun the dataset between the two looks: that file is its first.
+        if not (root / _NAME).exists():
+            if others:
+                raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
+            return
     described = folder.described()
     if (
         described["identity"] != name

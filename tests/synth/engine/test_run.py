@@ -17,7 +17,7 @@ from forked_workers import Forkserver
 
 from synth.cli import app
 from synth.dataset import index, provenance, size_forecast
-from synth.dataset.dataset_folder import Folder, Part, parse_part
+from synth.dataset.dataset_folder import Folder, Part, claim, parse_part
 from synth.engine import child, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup
@@ -85,6 +85,30 @@ class InProcess:
 
 
 PARTED = JOB.model_copy(update={"sequences": 14})
+
+
+def test_a_dataset_that_another_part_begins_meanwhile_is_not_foreign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look for its first file and the look for others."""
+    (tmp_path / "out").mkdir()
+    look, begun = Path.iterdir, list[Path]()
+
+    def begin_before(folder: Path) -> Iterator[Path]:
+        if folder == tmp_path / "out" and not begun:
+            begun.append(folder)
+            with claim(folder, PARTED, part=Part(2, 12)):
+                pass
+        return look(folder)
+
+    monkeypatch.setattr(Path, "iterdir", begin_before)
+    with claim(tmp_path / "out", PARTED, part=Part(1, 12)) as opened:
+        assert opened.is_begun
+    assert begun
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").touch()
+    with pytest.raises(UserError), claim(tmp_path / "other", PARTED):
+        pass
 
 
 def test_twelve_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
