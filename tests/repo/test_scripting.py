@@ -50,7 +50,7 @@ import numpy as np
 from bench.cli import app
 shape = (2, 48, 64)
 np.savez("press.npz", flow=np.ones((*shape, 2)), tissue=np.ones(shape[1:]), scale_mm_per_px=0.5)
-app(["estimate", "press.npz", "--out", "out"], standalone_mode=False)
+app(["estimate", "press.npz", "--membrane", "stripped", "--out", "out"], standalone_mode=False)
 """
 
 
