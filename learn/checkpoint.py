@@ -87,7 +87,7 @@ class ModelCard:
         given = f", and this is by {recovered_by}" if recovered_by else ""
         return [
             f"the network {trained}{given}: forces may be off, its intervals are not calibrated; "
-            "train it again on a dataset of this version, or give a pretrained network by --model"
+            "train it again on a dataset of this version"
         ]
 
     @property
