@@ -25,6 +25,7 @@ _LOW, _HIGH = 0.4, 1.2  # 1 plus the off-diagonal elements of published cameras'
 _CURVE = 0.3  # largest change of a level of a tone curve
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
 _INSET_PX, _ANATOMIES = 9, 3
+_EVEN = 0.425  # radius of a usual lamp's spot, in widths of the field
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
@@ -96,7 +97,9 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFr
     field = width * mm_per_px
     anatomy = {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "scenery": []}
-    drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}}
+    # A picture doesn't tell a lamp's fall-off from the lens': that of a usual lamp is left to the lamp.
+    light = {"even": [_EVEN, _EVEN]}
+    drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}, "light": light}
     scene = at_rest(Job.model_validate({"anatomy": anatomy, "render": view, **drawn}), index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
