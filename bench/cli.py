@@ -67,7 +67,7 @@ def score(
     """
     from threadpoolctl import threadpool_limits
 
-    from bench.methods.comparison import MAIN, PHYSICS
+    from bench.methods.comparison import PHYSICS
     from bench.methods.network import Model
     from bench.recording.recording_folder import open_recording
     from bench.scoring import score as scoring
@@ -85,7 +85,7 @@ def score(
         opened,
         model,
         methods={name: Model(Path(at)) for name, at in others.items()},
-        main=main or (MAIN if model else PHYSICS),
+        main=main or (None if model else PHYSICS),
         settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),
         out=folder,
         title=title,
@@ -147,39 +147,33 @@ def estimate(
     from threadpoolctl import threadpool_limits
 
     from bench.tracking.estimate import apply_physics, choose_input
-    from learn.inference.prediction_file import predict_files
-    from learn.inference.video_motion import VideoOptions, motions
+    from learn.inference.prediction_file import predict_files, summarise
+    from learn.inference.video_motion import motions, read_options
     from learn.training.threads import choose_threads
     from synth.flow.recording.decode import RecordingFlowSettings
-    from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
-    kind, files = read_choice(masks)
-    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
-    options = VideoOptions(read_scale(scale), tissue, settings, files)
+    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
+    options = read_options(read_scale(scale), tissue, masks, settings)
     threadpool_limits(choose_threads())
-    given = tissue is not None, files is not None
-    find = partial(
+    by_physics = partial(
         apply_physics,
         young_kpa=young,
         membrane=membrane,
         membrane_mn_per_mm=membrane_mn_per_mm,
         living=living,
-        is_given=given,
+        given=options.given,
     )
-    peaks, notes = dict[str, float | None](), dict[str, list[str]]()
-    for file in predict_files(
-        find, motions(source, choose_input(source, input), options), source, out, overlay
-    ):
-        peaks[file.name], notes[file.name] = file.peak_mn, file.notes
+    each, predicted = motions(source, choose_input(source, input), options), []
+    for file in predict_files(by_physics, each, source, out, overlay):
+        predicted.append(file)
         if not json:
             for note in file.notes:
                 typer.echo(f"note: {file.name}: {note}", err=True)
-            what = "no frame has a force" if file.peak_mn is None else f"peak force {file.peak_mn:.3g} mN"
-            typer.echo(f"{file.name}: {file.frames} frames, {what}")
+            typer.echo(file.text)
     if json:
-        print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
-    if all(peak is None for peak in peaks.values()):
+        print(json_.dumps(summarise(predicted, out)))
+    if all(file.peak_mn is None for file in predicted):
         raise typer.Exit(2)
 
 

@@ -228,16 +228,14 @@ def predict_command(
     """
     from learn.inference.apply import apply
     from learn.inference.predict import load_model
-    from learn.inference.prediction_file import predict_files
-    from learn.inference.video_motion import VideoOptions, motions
+    from learn.inference.prediction_file import predict_files, summarise
+    from learn.inference.video_motion import motions, read_options
     from learn.training.threads import choose_threads
     from synth.flow.recording.decode import RecordingFlowSettings
-    from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
-    kind, files = read_choice(masks)
-    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
-    options = VideoOptions(read_scale(scale), tissue, settings, files)
+    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
+    options = read_options(read_scale(scale), tissue, masks, settings)
     predicted = []
     predictor = load_model(model, threads=choose_threads(threads))
     each = motions(source, predictor.choose_source(input), options)
@@ -247,12 +245,9 @@ def predict_command(
         if not json:
             for note in file.notes:
                 _note(f"{file.name}: {note}")
-            what = "no frame has a force" if file.peak_mn is None else f"peak force {file.peak_mn:.3g} mN"
-            _console.print(f"{file.name}: {file.frames} frames, {what}")
+            _console.print(file.text)
     if json:
-        notes = {file.name: file.notes for file in predicted}
-        peaks = {file.name: file.peak_mn for file in predicted}
-        print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
+        print(json_.dumps(summarise(predicted, out)))
     if all(file.peak_mn is None for file in predicted):
         raise typer.Exit(2)
 

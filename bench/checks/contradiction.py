@@ -9,7 +9,7 @@ the noise on; one of N of a kind pays log N. Magnitudes and, if axes are known, 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -295,16 +295,19 @@ def _agrees(sensor: SensorMotion, force: Floats, best: _Judged) -> bool:
     if best.hypothesis.any_gain:
         gain = _gain(np.linalg.norm(force, axis=1), sensor.size_mn)
         return abs(np.log(max(gain, 1e-9))) > np.log(_BEYOND) and (gain > 1) == (best.gain > 1)
-    every = _judge(sensor, force, (1 / _BEYOND, _BEYOND))
-    same = [one for one in every if one.hypothesis.cause == best.hypothesis.cause]
-    return any(one.odds > _SURE and one.explains for one in same)
+    return _has_cause(_judge(sensor, force, (1 / _BEYOND, _BEYOND)), best)
 
 
 def _is_shown_by_motion(sensor: SensorMotion, best: _Judged) -> bool:
     """Whether the tissue's mean motion, which knows neither gain nor axes, has the same cause."""
-    motion, cause = replace(sensor, leading_mn=None), best.hypothesis.cause
-    same = [one for one in _judge(motion, *_estimate(motion)) if one.hypothesis.cause == cause]
-    return any(one.odds > _SURE and one.explains for one in same)
+    motion = replace(sensor, leading_mn=None)
+    return _has_cause(_judge(motion, *_estimate(motion)), best)
+
+
+def _has_cause(judged: Iterable[_Judged], best: _Judged) -> bool:
+    """Whether one of the judged hypotheses of the best one's cause is sure and explains the force."""
+    same = (each for each in judged if each.hypothesis.cause == best.hypothesis.cause)
+    return any(each.odds > _SURE and each.explains for each in same)
 
 
 def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:

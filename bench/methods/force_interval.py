@@ -23,9 +23,9 @@ import numpy as np
 from pydantic import ConfigDict, FiniteFloat, TypeAdapter
 
 from bench.methods.force_mixture import ForceMixture
-from bench.methods.method_interface import ForceEstimate
+from bench.methods.method_interface import ForceEstimate, MethodContext
 from learn.uncertainty.error_model import ErrorModel
-from synth.arrays import Floats
+from synth.arrays import Floats, Map
 from synth.job.types import Positive
 
 LEVEL = 0.9
@@ -151,6 +151,12 @@ def bound(
         for estimate, low, high in zip(estimates, *ends, strict=True)
     ]
     return bounded, ""
+
+
+def find_motion(flow: Map, scene: MethodContext) -> float:
+    """Mean length [mm] of a frame's flow (H, W, 2) px over the tissue."""
+    lengths = np.linalg.norm(flow[scene.tissue].astype(np.float64), axis=1)
+    return float(lengths.mean()) * scene.scale_mm_per_px
 
 
 def gather(

@@ -297,11 +297,12 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     low, high = scene.poisson
     middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
-    none, *every = TISSUES.membranes_mm
+    none, *stiffnesses = TISSUES.membranes_mm
     if scene.membrane_mn_per_mm is not None:
         ends = np.array(scene.membrane_mn_per_mm) / (scene.young_kpa or UNKNOWN_YOUNG_KPA)
-        every = sorted({float(f"{stiff:.2g}") for stiff in np.geomspace(ends[0], ends[1], TISSUES.shown)})
-    stiff = {"stripped": [none], "intact": every, "unknown": [none, *every]}[scene.membrane]
+        between = np.geomspace(ends[0], ends[1], TISSUES.shown)
+        stiffnesses = sorted({float(f"{stiffness:.2g}") for stiffness in between})
+    stiff = {"stripped": [none], "intact": stiffnesses, "unknown": [none, *stiffnesses]}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
     if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
@@ -340,8 +341,9 @@ def weigh_tissues(
     def evidence(tissue: TissueKind, load: Callable[..., LoadBasis] = posterior.load_basis) -> float:
         if tissue not in known:
             basis = load(len(own_mm), tissue)
-            every = (posterior.evidence(basis, frame, own_mm) for frame in strongest)
-            known[tissue] = TISSUES.temper * sum(every)
+            known[tissue] = TISSUES.temper * sum(
+                posterior.evidence(basis, frame, own_mm) for frame in strongest
+            )
         return known[tissue]
 
     candidates = candidate_tissues(scene)

@@ -14,6 +14,7 @@ from bench.methods.method_interface import ForceEstimate, MethodContext
 from bench.methods.physics import GRID, Physics
 from bench.tracking.contact_free import ContactFreeSearch
 from learn.data.clips import UNKNOWN_YOUNG_KPA
+from learn.inference.apply import gather_notes, to_video_px
 from learn.inference.video_motion import Motion, has_right_camera, motions, read_only, read_options
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
@@ -74,8 +75,7 @@ def estimate(
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps)
     motion = read_only(source, motions(source, choose_input(source, input), options))
-    is_given = tissue is not None, not isinstance(masks, str) or masks not in ("auto", "none")
-    return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, is_given)
+    return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, options.given)
 
 
 def choose_input(source: Path | Array, given: str | None) -> str:
@@ -102,12 +102,12 @@ def apply_physics(
     membrane: MembraneState = "unknown",
     membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
-    is_given: tuple[bool, bool] = (False, False),
+    given: tuple[bool, bool] = (False, False),
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa` to `living`: as of `estimate`; `is_given`: whether tissue and instruments are. Returns those
-    of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus or
+    `young_kpa` to `living`: as of `estimate`; `given`: as of `VideoOptions`. Returns those of
+    `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus or
     stiffness.
     """
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
@@ -118,24 +118,22 @@ def apply_physics(
         stiff = min(low, high), max(low, high)
     about: dict[str, Any] = {"living": living, "recovered_by": by, "membrane_mn_per_mm": stiff}
     scene, physics = MethodContext(motion.tissue, scale, young, membrane, **about), Physics()
-    found = _follow(motion, scene, physics)
+    followed = _follow(motion, scene, physics)
     findings = problems([*judge_young(young), *motion.findings])
-    fault = first_fault(findings)
-    trusted = found.trusted & (not fault)
+    trusted = followed.trusted & (not first_fault(findings))
     ends, warnings = np.full((len(trusted), 2), np.nan), list(physics.warnings)
     if trusted.any():
-        known = [found.estimates[k] for k in np.flatnonzero(trusted)]
-        stated = float(np.mean([*is_given, membrane != "unknown", not living]))
-        video = force_interval.gather(known, found.moved_mm[trusted], found.cameras, stated)
+        known = [followed.estimates[k] for k in np.flatnonzero(trusted)]
+        stated = float(np.mean([*given, membrane != "unknown", not living]))
+        video = force_interval.gather(known, followed.moved_mm[trusted], followed.cameras, stated)
         known, reason = force_interval.bound(known, video, 0.0, by)
         ends[trusted] = [(one.low_mn, one.high_mn) for one in known]
         warnings += [reason] if reason else []
-    # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-    centre = motion.shrink * (np.array(physics.view.centre_px) + 0.5) - 0.5
+    centre = to_video_px(np.array(physics.view.centre_px), motion)
     out: dict[str, Any] = {
         "density": physics.map_forces()[:, None],
-        "total_force_mn": np.where(trusted, [one.size_mn for one in found.estimates], np.nan),
-        "force_mn": np.where(trusted[:, None], [one.force_mn for one in found.estimates], np.nan),
+        "total_force_mn": np.where(trusted, [one.size_mn for one in followed.estimates], np.nan),
+        "force_mn": np.where(trusted[:, None], [one.force_mn for one in followed.estimates], np.nan),
         "trusted": trusted,
         "mask": physics.view.mask,
         "pitch_mm": GRID.pitch_mm,
@@ -144,20 +142,14 @@ def apply_physics(
         "centres_px": np.tile(centre, (len(trusted), 1)),
         "young_kpa": UNKNOWN_YOUNG_KPA if young is None else young,
         "young_known": young is not None,
-        "frame": found.index,
+        "frame": followed.index,
     }
-    if np.isfinite(found.time_s).any():
-        out["time_s"] = found.time_s
+    if np.isfinite(followed.time_s).any():
+        out["time_s"] = followed.time_s
     if np.isfinite(ends).any():
         out |= {"low_mn": ends[:, 0], "high_mn": ends[:, 1], "level": np.array([LEVEL])}
-    notes = [finding.message for finding in findings if finding.severity == "warning"]
-    notes += [*motion.notes, *physics.notes, *warnings]
-    if fault:
-        notes.insert(0, f"nothing can be measured: {fault}")
-    elif not trusted.all():
-        notes.append(f"{(~trusted).sum()} of {len(trusted)} frames could not be followed: they have no force")
-    out["notes"] = np.array(notes, dtype=str)
-    return out
+    notes = gather_notes((), findings, [*motion.notes, *physics.notes, *warnings], trusted)
+    return out | {"notes": notes}
 
 
 def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> Followed:
@@ -168,8 +160,7 @@ def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> Followed:
         physics(frame, scene, False)
         free.add(frame, frame.time_s or 0.0)
         time_s = math.nan if frame.time_s is None else frame.time_s
-        lengths = np.linalg.norm(frame.flow[motion.tissue].astype(np.float64), axis=1)
-        rows.append((frame.index, time_s, frame.trusted, scene.scale_mm_per_px * float(lengths.mean())))
+        rows.append((frame.index, time_s, frame.trusted, force_interval.find_motion(frame.flow, scene)))
         cameras = 1 if frame.motion is None else 2
     index, times, trusted, moved_mm = map(np.array, zip(*rows, strict=True))
     # False without spans.

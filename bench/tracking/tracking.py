@@ -218,8 +218,7 @@ class _Forces:
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
             speed = float(lengths.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
-        length = float(np.linalg.norm(frame.flow[inside].astype(np.float64), axis=1).mean())
-        self.motion_mm.append(length * scene.scale_mm_per_px)
+        self.motion_mm.append(force_interval.find_motion(frame.flow, scene))
         out.confidence.append(float(frame.confidence[inside].mean()))
         out.trusted.append(frame.trusted)
         out.speed.append(speed)

@@ -176,17 +176,22 @@ def measure(
     sectors = [_likeness(of_photo, of_photo[away_from[k]], near, region == k) for k in range(_FOLDS)]
     means = {key: float(np.mean([sector[key] for sector in sectors])) for key in sectors[0]}
     likeness.append({"crops": "control: the photograph's sectors, each by the others", **means})
-    vessels = [
+    vessels = _compare_lengths(lengths[~ours].mean(axis=0), lengths[ours].mean(axis=0))
+    lists = {"rows": rows, "likeness": likeness, "vessels": vessels}
+    return {"data": result_status.data(photo), "fitted": fitted, **lists}
+
+
+def _compare_lengths(theirs: Floats, ours: Floats) -> list[dict[str, Any]]:
+    """Rows of lengths of vessels by calibre (3,) mm/mm², the photograph's and the default job's."""
+    return [
         {
             "calibre, mm": name,
             "photograph, mm/mm²": float(a),
             "default job": float(b),
             "ratio": float(b / max(a, 1e-9)),
         }
-        for name, a, b in zip(CALIBRES, lengths[~ours].mean(axis=0), lengths[ours].mean(axis=0), strict=True)
+        for name, a, b in zip(CALIBRES, theirs, ours, strict=True)
     ]
-    lists = {"rows": rows, "likeness": likeness, "vessels": vessels}
-    return {"data": result_status.data(photo), "fitted": fitted, **lists}
 
 
 def _likeness(theirs: Floats, ours: Floats, near: Mask, of: Mask) -> dict[str, float]:

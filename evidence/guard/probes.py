@@ -114,7 +114,7 @@ def probe_picture() -> Arrays:
     """Pictures of both cameras, depth, highlights and shadows, of a usual and of a randomised scene."""
     arrays: Arrays = {}
     for name, keys in _PICTURES.items():
-        frames = _frames(keys)
+        _, frames = _scene(keys)
         arrays[f"{name}: left"] = np.stack([frame.rgb for frame in frames])
         depth = np.stack([frame.depth for frame in frames])
         arrays[f"{name}: depth"] = np.where(np.isfinite(depth), depth, 0.0)
@@ -128,8 +128,7 @@ def probe_picture() -> Arrays:
 
 def probe_truth() -> Arrays:
     """Labels of geometry and force on the pixels of a scene with two cameras, and the poses of the camera."""
-    scene = synth.simulate(_load("tiny", *_SMALL, *_PICTURES["stereo"]))
-    frames = [scene.frame(t) for t in range(len(scene))]
+    scene, frames = _scene(_PICTURES["stereo"])
     arrays: Arrays = {}
     for name in _TRUTH:
         values = np.stack([getattr(frame, name) for frame in frames]).astype(np.float64)
@@ -283,9 +282,9 @@ def _load(name: str, *keys: str) -> synth.Job:
     return synth.load_job(name, [*keys])
 
 
-def _frames(keys: Sequence[str]) -> list[synth.Frame]:
+def _scene(keys: Sequence[str]) -> tuple[synth.Scene, list[synth.Frame]]:
     scene = synth.simulate(_load("tiny", *_SMALL, *keys))
-    return [scene.frame(t) for t in range(len(scene))]
+    return scene, [scene.frame(t) for t in range(len(scene))]
 
 
 def _stored_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:

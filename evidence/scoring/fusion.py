@@ -141,8 +141,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
         for row in found["rows"]
         if (row["method"], row["tissue"]) == (PHYSICS, "intact")
     ]
-    every = {(row["cameras"], row["method"]): row for row in unknown if row["tissue"] == "all"}
-    one, two, both = every[1, PHYSICS], every[2, PHYSICS], every[2, FUSION]
+    by_method = {(row["cameras"], row["method"]): row for row in unknown if row["tissue"] == "all"}
+    one, two, both = by_method[1, PHYSICS], by_method[2, PHYSICS], by_method[2, FUSION]
     words = (
         f"**The error of physics' force is {two['whole'][0]:.0%} with two cameras and {one['whole'][0]:.0%} "
         f"with one; its fusion with the pretrained network errs by {both['whole'][0]:.0%} with two.**",

@@ -19,7 +19,7 @@ from synth.arrays import Array, Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
-from synth.flow.recording.finding import first_fault, judge_young, problems
+from synth.flow.recording.finding import Finding, first_fault, judge_young, problems
 from synth.job.types import MembraneState
 from synth.video.read_video import FPS
 
@@ -86,13 +86,11 @@ def apply(
         rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
         forces.append(estimator.estimate(frame))
     findings = problems([*judge_young(young), *motion.findings])
-    fault = first_fault(findings)
     numbers, times, followed = map(np.array, zip(*rows, strict=True))
-    trusted = followed & (not fault)
+    trusted = followed & (not first_fault(findings))
     force = np.where(trusted[:, None], [each.force_mn for each in forces], np.nan)
     last = forces[-1].map
-    # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-    centres = motion.shrink * (np.array([each.map.view.centre_px for each in forces]) + 0.5) - 0.5
+    centres = to_video_px(np.array([each.map.view.centre_px for each in forces]), motion)
     out: dict[str, Any] = {
         "density": np.stack([each.map.density for each in forces]),
         "total_force_mn": np.where(trusted, force_size(force), np.nan),
@@ -111,19 +109,33 @@ def apply(
     if last.force_mn is not None:
         out["force_mn"] = force
     doubt = predictor.card.doubt(motion.recovered_by)
-    warned = [finding.message for finding in findings if finding.severity == "warning"]
-    notes = [*doubt, *warned, *motion.notes, *estimator.notes]
+    notes = [*motion.notes, *estimator.notes]
     if motion.scale_known:
         notes += estimator.interval_notes
         out |= _ends(forces, trusted)
         if "low_mn" in out and not doubt:
             out["level"] = np.array(LEVELS)
-    if fault:
-        notes.insert(len(doubt), f"nothing can be measured: {fault}")
-    elif not trusted.all():
+    return out | {"notes": gather_notes(doubt, findings, notes, trusted)}
+
+
+def to_video_px(points: Floats, motion: Motion) -> Floats:
+    """Points (..., 2) px of a motion in the video's own pixels; coordinates are of pixel centres: a picture
+    begins at -0.5."""
+    return np.asarray(motion.shrink * (points + 0.5) - 0.5)
+
+
+def gather_notes(
+    doubt: Sequence[str], findings: Sequence[Finding], others: Sequence[str], trusted: Mask
+) -> Array:
+    """All notes on a prediction, (K,) str: `doubt` of the method, the fault or the warnings among the
+    findings, `others`, and the number of frames without a force, which are not `trusted` (T,)."""
+    fault = first_fault(findings)
+    notes = [*doubt, *([f"nothing can be measured: {fault}"] if fault else [])]
+    notes += [finding.message for finding in findings if finding.severity == "warning"]
+    notes += others
+    if not fault and not trusted.all():
         notes.append(f"{(~trusted).sum()} of {len(trusted)} frames could not be followed: they have no force")
-    out["notes"] = np.array(notes, dtype=str)
-    return out
+    return np.array(notes, dtype=str)
 
 
 def _ends(forces: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:

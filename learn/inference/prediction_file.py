@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,6 +79,18 @@ class PredictedFile(NamedTuple):
     frames: int
     peak_mn: float | None  # None: no frame has a force
     notes: list[str]
+
+    @property
+    def text(self) -> str:
+        """One line for a terminal."""
+        what = "no frame has a force" if self.peak_mn is None else f"peak force {self.peak_mn:.3g} mN"
+        return f"{self.name}: {self.frames} frames, {what}"
+
+
+def summarise(files: Sequence[PredictedFile], out: Path) -> dict[str, Any]:
+    """What a command prints as JSON of the files that it wrote into a folder."""
+    notes = {file.name: file.notes for file in files}
+    return {"out": str(out), "notes": notes, "peak_force_mn": {file.name: file.peak_mn for file in files}}
 
 
 def predict_files(

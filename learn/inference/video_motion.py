@@ -54,16 +54,21 @@ class VideoOptions:
     tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
     fps: float = video.FPS  # of pictures without times
 
+    @property
+    def given(self) -> tuple[bool, bool]:
+        """Whether tissue and instruments are given."""
+        return self.tissue is not None, self.tool is not None
+
 
 def read_options(
     scale_mm_per_px: StatedScale | None,
     tissue: str | Path | Array | None,
     masks: str | Path | Array,
     settings: RecordingFlowSettings,
-    fps: float,
+    fps: float = video.FPS,
 ) -> VideoOptions:
-    """The options of a video from the arguments of `learn.predict` and `bench.estimate`; UserError if one is
-    out of range. The masks' kind replaces that of the settings."""
+    """The options of a video from the arguments of `learn.predict` and `bench.estimate`, and of the commands;
+    UserError if one is out of range. The masks' kind replaces that of the settings."""
     as_positive("fps", fps)
     kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
     tissue = Path(tissue) if isinstance(tissue, str) else tissue

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.fit.photograph import Photograph, measure
-from synth.job.schema import Family, Job
+from synth.job.schema import Family, Job, LightSection
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera_sensor import CameraSensor, balanced_light, processed
 from synth.render.camera.colour_processing import PLAIN, ColourProcessing
@@ -25,7 +25,7 @@ _LOW, _HIGH = 0.4, 1.2  # 1 plus the off-diagonal elements of published cameras'
 _CURVE = 0.3  # largest change of a level of a tone curve
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
 _INSET_PX, _ANATOMIES = 9, 3
-_EVEN = 0.425  # radius of a usual lamp's spot, in widths of the field
+_EVEN = float(np.mean(LightSection().even))  # radius of a usual lamp's spot, in widths of the field
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {

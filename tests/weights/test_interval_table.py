@@ -77,18 +77,18 @@ def test_a_video_beyond_the_calibration_and_another_motion_have_none_but_a_reaso
 def test_estimates_get_ends_or_none() -> None:
     curve = np.sin(np.linspace(0, np.pi, 24)) ** 2
     likely = [ForceMixture(np.ones(1), c * np.eye(3)[:1], 0.04 * c**2 * np.eye(3)[None]) for c in 5 * curve]
-    every = [ForceEstimate(one.mean, low_mn=0.0, high_mn=9.0, likely=one) for one in likely]
-    video = gather(every, 0.05 * curve, 2, 0.5)
+    known = [ForceEstimate(force.mean, low_mn=0.0, high_mn=9.0, likely=force) for force in likely]
+    video = gather(known, 0.05 * curve, 2, 0.5)
     np.testing.assert_allclose(video.spread_mn, 0.2 * np.sqrt(3) * 5 * curve, atol=1e-6)
-    bounded, reason = bound(every, video, 0.0, read_table().flow)
+    bounded, reason = bound(known, video, 0.0, read_table().flow)
     assert reason == ""
     assert all(one.low_mn <= one.size_mn <= one.high_mn != 9.0 for one in bounded)
-    unknown = [*every[:-1], replace(every[-1], low_mn=math.nan, high_mn=math.nan)]
-    for estimates, by in ((every, "dis 1"), (unknown, read_table().flow)):
+    unknown = [*known[:-1], replace(known[-1], low_mn=math.nan, high_mn=math.nan)]
+    for estimates, by in ((known, "dis 1"), (unknown, read_table().flow)):
         bounded, reason = bound(estimates, video, 0.0, by)
         assert reason
         assert np.isnan([one.high_mn for one in bounded]).all()
-        assert [one.size_mn for one in bounded] == [one.size_mn for one in every]
+        assert [one.size_mn for one in bounded] == [one.size_mn for one in known]
 
 
 def test_the_stored_table_is_read_back(table: IntervalTable) -> None:

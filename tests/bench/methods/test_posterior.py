@@ -167,9 +167,9 @@ def test_a_stated_stiffness_of_the_membrane_gives_the_force(basis: LoadBasis) ->
     true, sizes = np.hypot(1.0, 4.0), []
     for stiff in ((80.0, 80.0), (10.0, 10.0)):
         scene = MethodContext(*known, membrane_mn_per_mm=stiff)
-        found = physics.weigh_tissues(scene, frames, STILL)
-        assert {one.membrane for one in found.tissues} == {stiff[0] / young}
-        sizes.append(float(np.linalg.norm(physics.infer(found, frames[1]).force.mean)))
+        weights = physics.weigh_tissues(scene, frames, STILL)
+        assert {tissue.membrane for tissue in weights.tissues} == {stiff[0] / young}
+        sizes.append(float(np.linalg.norm(physics.infer(weights, frames[1]).force.mean)))
     assert sizes[0] == pytest.approx(true, rel=0.15)
     assert sizes[1] < 0.9 * sizes[0], "a membrane that is stated too soft hides force"
     between = MethodContext(*known, membrane_mn_per_mm=(60.0, 100.0))
@@ -177,8 +177,8 @@ def test_a_stated_stiffness_of_the_membrane_gives_the_force(basis: LoadBasis) ->
 
 
 def test_evidence_for_a_soft_membrane_is_not_taken_for_certain() -> None:
-    every = [TissueKind("bonded", membrane, 0.45, 1.02) for membrane in (5.0, 15.0, 40.0, 100.0)]
-    shares = physics._share(every, [0.0, -20.0, -80.0, -400.0], [-1.0, -1.0, -1.0, -1.0])
+    tissues = [TissueKind("bonded", membrane, 0.45, 1.02) for membrane in (5.0, 15.0, 40.0, 100.0)]
+    shares = physics._share(tissues, [0.0, -20.0, -80.0, -400.0], [-1.0, -1.0, -1.0, -1.0])
     weight = np.exp(list(shares.values()))
     assert len(shares) == 3
     assert weight.max() == pytest.approx(np.exp(-1.0))

@@ -171,12 +171,12 @@ def test_the_first_screen_has_four_answers_in_few_words(make: Maker) -> None:
 def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
     result = run(make(), physics=Bump())
     curve = result.methods["physics"].size_mn
-    one = VideoEstimates(curve, 0.1 * curve, 0.01 * curve, 1, 0.5)
-    result.tracked.evidence, result.tracked.stated = one, (True, False, True, False)
+    video = VideoEstimates(curve, 0.1 * curve, 0.01 * curve, 1, 0.5)
+    result.tracked.evidence, result.tracked.stated = video, (True, False, True, False)
     gains = find_gains(result, 10.0, 6.0, 14.0)
     ratios = read_table().stating
     narrower = {"camera": ratios["second camera"] < 0.98, "masks": ratios["statements"] ** 0.5 < 0.98}
     for word, known in narrower.items():
         assert any(word in line for line in gains) == known
-    result.tracked.evidence = replace(one, cameras=2, stated=1.0)
+    result.tracked.evidence = replace(video, cameras=2, stated=1.0)
     assert find_gains(result, 10.0, 6.0, 14.0) == ()
