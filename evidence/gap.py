@@ -63,7 +63,7 @@ def measure(
     clinical: Path,
     recordings: Path,
     work: Path = Path("runs/gap"),
-    fit: int = 375,
+    fit: int = 240,
     epochs: int = 96,
     seeds: int = 1,
     kinds: str = ",".join(KINDS),
@@ -424,6 +424,6 @@ STUDY = Study(
     measure,
     "gap/results.json",
     page,
-    ("{gap-mission} {gap-ood} {gap-clinical} {work}/foreign --work {work}/gap-study",),
+    ("{mission} {mission-ood} {gap-clinical} {work}/foreign --work {work}/gap-study",),
     needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
 )

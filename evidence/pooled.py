@@ -1,20 +1,40 @@
 """Recordings scored by `bench score`, and pooled on a page by `bench pool`."""
 
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from bench.methods.comparison import PHYSICS
+from bench.recording import recording_writer
+from bench.recording.meta import read_meta
 from bench.scoring import pool
 from evidence import report
 from synth.errors import UserError
+from synth.system import checked_file
 
 # Options of `bench score` by number of cameras: with two a pretrained network is scored next to physics.
 _OPTIONS = {1: (), 2: ("--model", "stereo", "--main", PHYSICS)}
 FOLDERS = {1: "monocular", 2: "stereo"}  # of the results, likewise
 _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers, which the page counts
+
+
+RIGHT = "right.mp4", "pair.yaml"
+"""Files of a recording's right camera: its video and the calibration."""
+
+
+def copy_left(both: Path, left: Path) -> None:
+    """Copies a recording with two cameras without its right one, unless that has been done."""
+    if left.exists():
+        return
+    with checked_file.folder_of(left) as part:
+        shutil.copytree(both, part, ignore=shutil.ignore_patterns(*RIGHT), dirs_exist_ok=True)
+        meta = read_meta(both / "meta.yaml")
+        recording_writer.write_meta(
+            part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"})
+        )
 
 
 def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:

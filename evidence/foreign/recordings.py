@@ -9,7 +9,6 @@ contributes texture, the tools' shape and motion, the sensor and the folder's la
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
@@ -24,9 +23,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import Delaunay
 
 from bench.recording import recording_writer
-from bench.recording.meta import read_meta
 from evidence import report
-from evidence.pooled import FOLDERS, score_and_pool
+from evidence.pooled import FOLDERS, copy_left, score_and_pool
 from evidence.scoring.exvivo import ramp
 from evidence.study import Study
 from synth.arrays import Floats, Map, Pixels
@@ -71,14 +69,7 @@ def measure(
             with checked_file.folder_of(both) as part:
                 rng = np.random.default_rng([seed, KINDS.index(kind), index])
                 record(part, both.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
-        if not left.exists():
-            with checked_file.folder_of(left) as part:
-                right = shutil.ignore_patterns("right.mp4", "pair.yaml")
-                shutil.copytree(both, part, ignore=right, dirs_exist_ok=True)
-                meta = read_meta(both / "meta.yaml")
-                recording_writer.write_meta(
-                    part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"})
-                )
+        copy_left(both, left)
         folders[2].append(both)
         folders[1].append(left)
     for cameras, of in folders.items():

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.recording import recording_writer
 from evidence import report
-from evidence.pooled import FOLDERS, score_and_pool
+from evidence.pooled import FOLDERS, RIGHT, copy_left, score_and_pool
 from evidence.study import Study
 from synth.arrays import Floats, Ints, Pixels
 from synth.errors import UserError
@@ -39,7 +39,8 @@ _GESTURES = 3
 _LEVELS = 9
 _SENSOR_HZ = 200.0
 _STILL_S = 1.5
-_STEREO_MM, _PAIR = 24.0, "pair.yaml"
+_STEREO_MM = 24.0
+_VIDEO, _PAIR = RIGHT
 _SYNC_S = 9.0
 _PRESS_S = 13.0
 _LATE, _LATE_S = 0.2, 0.8  # creep: delayed share of the response, and its time constant [s]
@@ -53,23 +54,28 @@ def measure(
     width: int = 320,
     photo: Path | None = None,
     seed: int = 100,
-    cameras: int = 1,
     results: Path = report.RESULTS / "exvivo",
 ) -> None:
-    """Renders ex vivo stand-ins into the folder `recordings` and scores them into `results`.
+    """Renders ex vivo stand-ins into the folder `recordings` and scores them, with both cameras and with the
+    left one alone, into `results`.
 
     `seconds`: length of each; `fps`: mean frames a second; `width`: of the image, 4:3; `photo`: a photograph
-    as texture of the surface; `cameras`: 1, monocular, or 2, stereo.
+    as texture of the surface.
     """
     texture = photo.resolve() if photo else None
-    plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, cameras)
-    folders = [recordings / f"{index:03d}" for index in range(count)]
-    for index, folder in enumerate(folders):
-        if not folder.exists():
+    plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture)
+    folders = {
+        cameras: [recordings / name / f"{index:03d}" for index in range(count)]
+        for cameras, name in FOLDERS.items()
+    }
+    for index, (left, both) in enumerate(zip(folders[1], folders[2], strict=True)):
+        if not both.exists():
             count_frames = counting(f"recording {index}", int(seconds * fps))
-            with count_frames as progress, checked_file.folder_of(folder) as part:
+            with count_frames as progress, checked_file.folder_of(both) as part:
                 make(plan, index, part, progress)
-    score_and_pool(folders, cameras, results / FOLDERS[cameras])
+        copy_left(both, left)
+    for cameras, of in folders.items():
+        score_and_pool(of, cameras, results / FOLDERS[cameras])
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,6 @@ class Plan:
     fps: float = 10.0
     size: tuple[int, int] = (320, 240)
     photo: Path | None = None  # texture of the surface; None: procedural
-    cameras: int = 1
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ def job_of(plan: Plan) -> jobs.Job:
                 "size": plan.size, "spp": 4, "field_mm": [30.0, 40.0], "tilt_deg": [5.0, 25.0],
                 "working_distance_mm": [220.0, 380.0], "aperture_mm": 6.0,
                 "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0],
-                "stereo_mm": _STEREO_MM if plan.cameras == 2 else 0.0,
+                "stereo_mm": _STEREO_MM,
             },
         }
     )  # fmt: skip
@@ -141,21 +146,21 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
     steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
     times = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
     renderer = scene.renderer
-    pictures: list[tuple[Pixels, Pixels | None]] = []
+    assert renderer.right is not None
+    pictures: list[tuple[Pixels, Pixels]] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
         vertices, tips, shafts = _pose(scene.shape, motion, gesture, course, at, rng)
         shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
+        assert shot.rgb_right is not None
         pictures.append((shot.rgb, shot.rgb_right))
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
     crf = int(rng.integers(18, 25))
     recording_writer.write_video(part / "video.mp4", (left for left, _ in pictures), times, crf=crf)
-    if renderer.right is not None:
-        right = (one for _, one in pictures if one is not None)
-        recording_writer.write_video(part / "right.mp4", right, times, crf=crf)
-        recording_writer.write_pair(part / _PAIR, scene.view, renderer.right)
+    recording_writer.write_video(part / _VIDEO, (right for _, right in pictures), times, crf=crf)
+    recording_writer.write_pair(part / _PAIR, scene.view, renderer.right)
     cv2.imwrite(str(part / "tissue.png"), scene.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
@@ -169,9 +174,8 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
         "press_s": [_SYNC_S, _PRESS_S],
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": free_s.tolist()},
+        "stereo": {"calibration": _PAIR},
     }
-    if renderer.right is not None:
-        about["stereo"] = {"calibration": _PAIR}
     recording_writer.write_meta(part, about)
 
 
@@ -259,9 +263,6 @@ def ramp(s: Floats) -> Floats:
 STUDY = Study(
     measure,
     "exvivo/*/pool.json",
-    steps=tuple(
-        f"{{work}}/exvivo-{folder} --photo {{photo}} --cameras {cameras}"
-        for cameras, folder in FOLDERS.items()
-    ),
+    steps=("{work}/exvivo --photo {photo}",),
     needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
 )

@@ -18,7 +18,7 @@ _METALS: tuple[Rgb, ...] = (0.67, 0.64, 0.60), (0.67, 0.64, 0.60), (0.62, 0.58, 
 _ALPHAS = (0.10, 0.17), (0.10, 0.15), (0.5, 0.9), (0.06, 0.15)  # GGX, across: satin, brushed, matte, polished
 _STREAKS = 3.2, 4.2, 1.0, 1.0  # of that along it
 _SHARES = 0.7, 0.3, 0.0, 0.0  # of these among instruments in use
-_INSULATED = {"forceps": 0.5, "bayonet": 0.6, "suction": 0.2, "spatula": 0.1}
+_INSULATED = {"forceps": 0.5, "bayonet": 0.6, "suction": 0.2}
 SOLD: tuple[Rgb, ...] = (  # insulation: blue, black, white, green, yellow, grey
     (0.05, 0.11, 0.29), (0.02, 0.02, 0.02), (0.7, 0.7, 0.7), (0.06, 0.21, 0.14), (0.6, 0.45, 0.12), (0.3,) * 3
 )  # fmt: skip

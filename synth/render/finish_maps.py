@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from synth.arrays import Floats, Indices, Map
 from synth.render.anatomy.layers import Rgb, over, ridge, step, through
@@ -19,21 +20,28 @@ from synth.render.materials import FinishMaps
 
 RING = 32  # vertices of each of a closed bar's rings
 _ACROSS = 24, 224  # rows of texels, least and most
-_MOST_ALONG = 640  # columns of a bar's
+_MOST_ALONG = {"spatula": 1600}  # columns of a bar's; 640 of others: a wide blade would show them
 _WIDE_MM = 5.0  # of a usual part's shown half, by which the texels are as large as the picture's pixels
 _PLASTIC = np.full(3, 0.04, np.float32)  # reflectance at right angles, at an index of 1.5
 _BLOOD = np.array([0.20, 0.006, 0.005], np.float32)  # albedo of a clot
+_THINNED = 0.4  # of blood's depth, on a blade
 _FILM = 0.45, 3.2, 3.6  # absorption of a film of blood, passed twice
 _LEAST = 0.1  # of the roughness across by that along
 _WARP = 0.03  # height of a blade's unevenness
 _HOLLOW = 0.2  # depth of a blade's hollow, as a share of half its width
 _BLOOD_MM = 0.025  # height of a film of blood
-_LINES_PX = 0.8  # rows, half the width of lines along a part
+_LINES_PX = 0.8, 1.7  # rows, half the width of lines along a part, and along a blade, where rows run apart
 _STEEPEST = 1.0  # slope of bumps
 _CHALK, _DULLED = 0.03, 0.8  # light that a handled coat scatters, and rise of its roughness
 _ROUNDED = 0.55, 2.6  # light that a coat lacks at a shaft's sides, and the power of the place across
 _GLINTS = (0.1, 0.10, 0.42), (-0.62, 0.05, 0.10), (0.9, 0.05, 0.12)  # on a coat: place across, width, light
 _BANDS = (0.46, 0.18, 0.45), (-0.4, 0.2, 0.5), (0.98, 0.08, 0.3), (-0.98, 0.08, 0.3)  # dark ones on steel
+_BLADE = (0.7, 0.5, 0.55), (-0.8, 0.4, 0.5), (-0.15, 0.1, 0.12)  # dark bands on a flat blade
+_REDDENED_MM, _REDDENED = (
+    9.0,
+    np.array((0.08, 0.32, 0.38), np.float32),
+)  # reach of the tissue's tint; its depth
+_BRIM = 0.93, 0.05, 0.35  # its edge: place of the dark line beside it, width, added light
 _CREST = 0.05, 0.08, 0.5  # its bright one: place across, width, share of it that scatters
 _COLLAR_MM = 0.9, 0.13  # length of the collar in which a coat begins, and width of the grooves beside it
 _WEAVE_MM = 0.42  # between the threads of a patty,
@@ -167,7 +175,7 @@ def _lay_out(
         body = rings[len(rings) // 3, shown]
         outline = float(np.linalg.norm(np.diff(body, axis=0), axis=1).sum())
         height = int(np.clip(max(_WIDE_MM, 0.9 * outline) / mm_per_px, *_ACROSS))
-        size = height, min(4 * height, _MOST_ALONG)
+        size = height, min((8 if kind == "spatula" else 4) * height, _MOST_ALONG.get(kind, 640))
         rows = np.interp(np.linspace(0, 1, height), _share_of_outline(rings[:, shown]), np.arange(len(shown)))
         place = _texels(rings[:, shown].swapaxes(0, 1), size, rows)
         turned = _texels(_edges(rings)[:, shown].T[..., None], size, rows)
@@ -177,7 +185,7 @@ def _lay_out(
     mottle, grain = noise(place, 1.1, rng), noise(place, 0.35, rng)
     across = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1).cumsum(axis=0)
     full = across[-1] / across[-1, : size[1] // 2].max()
-    lines = grain if sheet_rows else _lines(across, rng)
+    lines = grain if sheet_rows else _lines(across, _LINES_PX[kind == "spatula"], rng)
     # Where a bar narrows to its tip, the texture's rows run apart, and bumps along them would show its faces.
     flat = np.ones_like(full) if sheet_rows else step(1.6 * full - 0.9)
     return _Texels(
@@ -211,6 +219,8 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
         place, width, most = _CREST
         broken = np.clip(0.8 + 0.2 * lines + 0.2 * mottle, 0, 1) * texels.flat
         polished = np.asarray(most * broken * ridge(texels.across - place, width), np.float32)
+    if kind == "spatula":
+        base = np.asarray(base * _sheen(texels), np.float32)
     base, bumps = _shaped(texels, coat, base, bumps)
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
     handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
@@ -228,6 +238,20 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     rough = over(rough, glossy * (1 + _DULLED * handled[..., None]), coat[..., None])
     bare = (1 - coat) * (1 - finish.scattered) * (1 - polished)
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
+
+
+def _sheen(texels: _Texels) -> Map:
+    """Light (h, w, 3) that a flat blade mirrors, as a share of a lamp's: bent by hand, it shows the dark
+    room and the bright field in soft bands along it, red near its tip, darkest beside its bright edges."""
+    wander = gaussian_filter1d(texels.blotch.mean(axis=0), 0.1 * texels.blotch.shape[1], mode="nearest")
+    turned = texels.across + 0.35 * wander / max(float(wander.std()), 0.1) + 0.015 * texels.lines
+    dark = sum(depth * ridge(turned - place, width) for place, width, depth in _BLADE)
+    place, width, bright = _BRIM
+    aside = np.abs(texels.across)
+    brim = bright * ridge(aside - 1, 0.5 * width) - 0.3 * ridge(aside - place, width)
+    light = np.clip(1 - dark, 0.2, 1) + brim * texels.flat
+    near = np.exp(-texels.along / _REDDENED_MM)
+    return np.asarray(light[..., None] * (1 - near[..., None] * _REDDENED), np.float32)
 
 
 def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map) -> tuple[Map, Map]:
@@ -326,6 +350,8 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
     deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
     # In cloth blood is soaked up, and its threads show.
+    if texels.kind == "spatula":  # on a smooth blade it is wiped to a thin film, thicker along its border
+        deep = _THINNED * deep * np.clip(0.9 + 0.1 * texels.lines + 0.35 * texels.mottle, 0.2, 1.6)
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5) * (not texels.sheet)
     if texels.sheet:
         deep = np.clip(deep * (0.6 + 0.3 * texels.mottle), 0, _DRUNK)
@@ -381,15 +407,15 @@ def _texels(grid: Floats, size: tuple[int, int], rows: Floats | None = None) -> 
     return np.asarray(cv2.remap(np.ascontiguousarray(grid, np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
-def _lines(across: Map, rng: np.random.Generator) -> Map:
+def _lines(across: Map, width_px: float, rng: np.random.Generator) -> Map:
     """Lines (h, w) along a part, each of some length, unit variance.
 
-    `across`: (h, w) mm from its one side.
+    `across`: (h, w) mm from its one side; `width_px`: half their width, rows.
     """
     height, width = across.shape
     coarse = rng.normal(size=(height, 12)).astype(np.float32)
     lines = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-    lines = cv2.GaussianBlur(lines, (1, 0), sigmaX=1e-3, sigmaY=_LINES_PX)  # as wide as the picture resolves
+    lines = cv2.GaussianBlur(lines, (1, 0), sigmaX=1e-3, sigmaY=width_px)  # as wide as the picture resolves
     # They are parallel in space: where a bar narrows to its tip, the outer ones end.
     row = (across - across[height // 2]) / np.maximum(across[-1], across[-1, : width // 2].max())
     row = ((height - 1) * row + height // 2).astype(np.float32)

@@ -29,8 +29,8 @@ _DULL = Finish(  # a retractor's, darkened against glare
     (0.38, 0.365, 0.35), 0.2, 2.0, scattered=0.05, wear=0.35, blood=0.3, blood_mm=5.0, wet_mm=3.0
 )
 _WIRE = Finish((0.6, 0.58, 0.55), 0.12, 2.0, scattered=0.1, wear=0.3, blood_mm=4.0)
-_CLIP_MM = 3.4, 2.1  # length along the skin's edge and radius
-_GROUPS, _TOGETHER = (3, 6), (2, 4)  # clips: numbers of groups, and in each
+_CLIP_MM = 4.6, 2.7  # length along the skin's edge and radius
+_GROUPS, _TOGETHER = (2, 5), (1, 3)  # clips: numbers of groups, and in each
 _GAP_MM, _BEHIND_MM = 1.2, 0.5  # between two, and from the skin's edge
 _FOLD = 0.86, 26, 0.1  # of skin that they grip: radius as a share of theirs, its rings, and its unevenness
 _FLESH = Finish((0.5, 0.5, 0.5), 0.3, coat=(0.4, 0.07, 0.04), coat_alpha=0.25, bare_mm=-1.0)

@@ -29,7 +29,7 @@ from synth.tune.search import changed
 def test_a_stereo_stand_in_fits_its_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job_of, coarse = exvivo.job_of, {"fem.tets": 600, "anatomy.vertices": 4000}
     monkeypatch.setattr(exvivo, "job_of", lambda plan: changed(job_of(plan), coarse))
-    plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72), cameras=2)
+    plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72))
     exvivo.make(plan, 0, tmp_path / "000")
     recording = open_recording(tmp_path / "000")
     left, right = list(recording.frames()), list(recording.right_frames())

@@ -18,7 +18,7 @@ from synth.system.jit import argument_types, compiled
 _MOST = 60_000  # nodes
 _NEAR = 0.35  # of a step: a branch that ends nearer to its sister than this is the sister
 # Cosine and sine of the widest angle at which a side branch leaves.
-_FORWARD = float(np.cos(np.radians(50))), float(np.sin(np.radians(50)))
+_FORWARD = float(np.cos(np.radians(44))), float(np.sin(np.radians(44)))
 _PUSHED = 0.4  # of a step, standard deviation of what a branch strays
 
 

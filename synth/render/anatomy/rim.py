@@ -42,16 +42,16 @@ class Opening:
 
 
 class CutEdge:
-    """Cross-section of the dura's thin cut edge [mm]: rings from its underside over its lip to its top."""
+    """Cross-section of the dura's thin cut edge [mm]: rings from the fluid below over its lip to its top."""
 
-    lip: float = 0.35  # overhang over the brain
-    inside: tuple[float, ...] = (1.0, 0.95, 0.65, 0.3, 0.05)  # its rings, as shares of the lip
-    height: tuple[float, ...] = (-1.7, -0.1, 0.08, 0.2, 0.27)  # of its rings over the brain
+    lip: float = 0.45  # overhang over the brain
+    inside: tuple[float, ...] = (1.5, 1.0, 0.7, 0.35, 0.05)  # its rings, as shares of the lip
+    height: tuple[float, ...] = (-1.1, 0.0, 0.09, 0.17, 0.23)  # of its rings over the brain
     painted: tuple[float, ...] = (-2.6, -1.1, -0.8, -0.5, -0.2)  # radii of its rings in the texture
-    top: tuple[float, float] = 0.12, 0.3  # start of the dura's outer face: outwards, over the brain
+    top: tuple[float, float] = 0.12, 0.26  # start of the dura's outer face: outwards, over the brain
     albedo: Rgb = (0.9, 0.7, 0.58)  # of its section
     width: float = 0.2
-    shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
+    shadow: Rgb = (0.2, 0.5, 0.55)  # absorption that darkens its underside
 
 
 class Suture:
@@ -65,10 +65,10 @@ class Suture:
 class Dura:
     """The dura around the opening, pulled up at stitches, folded between them [mm]."""
 
-    width: tuple[float, float] = 1.2, 0.7  # mean and spread around the opening, see `_uneven`
+    width: tuple[float, float] = 1.3, 1.1  # mean and spread around the opening, see `_uneven`
     pulled: tuple[float, float] = 2.1, 2.2  # added width at a stitch, and over what distance aside
     slope: float = 0.25  # rise outwards
-    tent: tuple[float, float] = 0.7, 1.3  # height at a stitch, and over what distance
+    tent: tuple[float, float] = 0.5, 1.3  # height at a stitch, and over what distance
     folds: tuple[float, float, float] = (
         0.16,
         2.1,
@@ -88,9 +88,9 @@ class Flap:
     count: tuple[int, int] = (2, 5)
     corners: tuple[int, int] = (11, 19)  # between straight cuts of the scissors
     cut: tuple[float, float] = 0.4, 2.6  # what they leave at a corner
-    width: tuple[float, float] = 0.8, 3.2  # of the inner face in a flap's middle
+    width: tuple[float, float] = 0.8, 4.6  # of the inner face in a flap's middle
     beyond: float = 1.6  # by how much the dura ends beyond the crease, at most
-    long: tuple[float, float] = 0.35, 1.0  # rad, half of a flap's length
+    long: tuple[float, float] = 0.4, 1.1  # rad, half of a flap's length
     ragged: float = 0.12  # spread of the dura's end, as cut by hand
     height: float = 0.16  # of the crease
     albedo: Rgb = (0.87, 0.66, 0.53)  # of the inner face: smooth and pale
@@ -104,6 +104,8 @@ class Blood:
     pool: tuple[float, float] = 4.2, 0.45  # optical depth where deepest, and how much of the noise is one
     runs: float = 1.1  # mm that a pool runs over the dura's end, thinning
     smear: float = 0.8  # optical depth
+    flood: tuple[float, float] = 1.4, 0.5  # optical depth of the film over bone and skin on the wound's lower
+    # side, and the level from which on it is
     drops: float = 12.0  # mean number on a soaked rim
     drop_mm: tuple[float, float] = 0.12, 0.55  # radius
 
@@ -142,6 +144,7 @@ class Bone:
     """The bone's cut edge from its foot up: inner table, diploe, outer table, then its outer surface [mm]."""
 
     tables: tuple[float, float, float] = 0.4, 1.85, 2.35  # ends of the three
+    slant: float = 0.35  # spread of the widths at which they are seen
     rise: float = 2.6
     bare: tuple[float, float] = 5.0, 1.5  # from its foot to where soft tissue covers it: mean and spread
     compact: Rgb = (0.86, 0.76, 0.58)  # albedo
@@ -155,6 +158,10 @@ class Drape:
 
     away: tuple[float, float] = 3.0, 0.8  # mean and spread
     beyond: float = 1.2  # least distance behind the skin's edge
+    towels: tuple[float, float] = 0.96, 1.2  # distance of four straight hems from the middle over that of the
+    # nearest place which the drapes reach,
+    turned: float = 0.16  # rad, standard deviation of their directions,
+    over_wall: float = 0.9  # and least distance behind the wall's foot: they lie over bone and skin
     thread: float = 0.34  # from one of its threads to the next
     blue: Rgb = (0.07, 0.20, 0.42)
     green: Rgb = (0.06, 0.28, 0.26)
@@ -216,6 +223,8 @@ def build(
     skin = wall + Skin.boned * bone + _wave(rng, angle, *(Skin.clipped if clipped else Skin.away))
     cloth = wall + _wave(rng, angle, *Drape.away)
     cloth = np.maximum(cloth, skin + Drape.beyond) if "drape" in appearance.scenery else np.zeros(0)
+    if len(cloth):
+        cloth = _towels(appearance, angle, edge + cloth, edge + wall + Drape.over_wall) - edge
     high, reach = Dura.tent
     tents = high * ridge(asides[..., None], reach).max(axis=0) * ridge(away, at=0.8, width=reach)
     outer = np.clip(away, 0, None)
@@ -242,6 +251,16 @@ def build(
     return Rim(
         Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, bare, skin, cloth
     )
+
+
+def _towels(appearance: Appearance, angle: Floats, reach: Floats, least: Floats) -> Floats:
+    """Radii (A,) mm at which four straight drapes start, about `reach` and nowhere below `least`."""
+    rng = np.random.default_rng([appearance.rim_seed, 8])
+    sides = rng.uniform(0, 2 * np.pi) + np.arange(4) * np.pi / 2 + rng.normal(0, Drape.turned, 4)
+    away = float(reach.mean()) * rng.uniform(*Drape.towels, 4)
+    facing = np.cos(_aside(angle, sides[:, None]))
+    hems = np.where(facing > 0.1, away[:, None] / np.maximum(facing, 0.1), np.inf).min(axis=0)
+    return np.asarray(np.maximum(hems, least))
 
 
 def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Floats, Floats]:
@@ -423,11 +442,23 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     tight = np.zeros_like(away)  # share of bone and skin, which soak up no fluid
     if rim.bone:
         beyond, relief, tight = _with_bone(
-            (beyond, relief), past, _round(rim.bare, angle), wiped, appearance.blood, mottle, grain, fine
+            (beyond, relief),
+            past,
+            _round(rim.bare, angle),
+            wiped,
+            appearance.blood,
+            wide,
+            mottle,
+            grain,
+            fine,
         )
     beyond, relief, skin = _with_skin(
         (beyond, relief), away - _round(rim.skin, angle), wiped, appearance.blood, mottle, grain, fine
     )
+    most, level = Blood.flood
+    lower = np.cos(angle - float(rim.stitches[-1])) + 0.45 * wide + 0.1 * mottle + 2 * appearance.blood
+    flood = most * np.clip(lower - 1 - level, 0, 1) * np.clip(1.4 - 0.12 * past, 0, 1)
+    beyond = through(beyond, np.minimum(flood, 6 * appearance.blood), Wound.blood)
     run = np.clip((away - reach) / Blood.runs + 0.3 * mottle, 0, 3)
     tight = np.maximum(tight, skin)
     beyond = through(beyond, depth * pool * np.exp(-run) * (1 - tight), Wound.blood)
@@ -513,14 +544,23 @@ def _muscle(
 
 
 def _with_bone(
-    below: tuple[Map, Map], past: Map, bare: Map, wiped: Map, blood: float, mottle: Map, grain: Map, fine: Map
+    below: tuple[Map, Map],
+    past: Map,
+    bare: Map,
+    wiped: Map,
+    blood: float,
+    wide: Map,
+    mottle: Map,
+    grain: Map,
+    fine: Map,
 ) -> tuple[Map, Map, Map]:
     """Albedo and bumps with bone over the wall, from its cut edge to where soft tissue covers it, and its
     share; `below`: albedo and bumps of that, `past`: mm from the wall's foot."""
     inner, pores, edge = Bone.tables
-    place = past + 0.05 * mottle + 0.02 * grain
+    # A saw cuts at a slant, so that the skull seems thick here and thin there.
+    place = past / np.clip(1 + Bone.slant * wide, 0.5, 1.8) + 0.05 * mottle + 0.02 * grain
     spongy = step((place - inner) / 0.12) * step((pores - place) / 0.12)
-    hole = step((grain + 0.3 * mottle + 0.2 * fine - 1.0) / 0.5) * spongy
+    hole = step((grain + 0.3 * mottle + 0.5 * wide + 0.2 * fine - 1.2) / 0.5) * spongy
     surface = step((place - edge) / 0.15)
     compact = speckled(Bone.compact, 0.05 * mottle, 0.025 * grain, 0.03 * fine)
     bone = over(compact, speckled(Bone.spongy, 0.2 * grain, 0.1 * fine), spongy[..., None])

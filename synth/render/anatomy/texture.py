@@ -74,13 +74,13 @@ class Artery:
     absorption_per_mm: Rgb = (0.42, 4.25, 6.0)
     rosy: Rgb = (0.9, 4.4, 4.6)  # that of wide ones and of some stretches, under more of the arachnoid
     rosy_share: tuple[float, float, float] = 0.1, 0.55, 0.3  # of it: of fine ones, of wide ones more, spread
-    opaque: tuple[float, float] = 0.29, 0.08  # depth that even fine ones reach, and the chord for 63% of it
+    opaque: tuple[float, float] = 0.3, 0.08  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.72, 0.22, 0.165)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
     rim_dark: Rgb = (0.35, 0.8, 0.7)  # absorption
-    covered: tuple[float, float] = 0.95, 0.28  # of its redness along it, by the arachnoid: mean, and spread
+    covered: tuple[float, float] = 0.98, 0.3  # of its redness along it, by the arachnoid: mean, and spread
 
 
 class Vein:
@@ -104,7 +104,7 @@ class Vein:
     # nearly all, so that the highlight never ends; the wall's long waves vary its width
     dry: tuple[float, float] = 0.8, 0.2  # share of a thick one's crest under a thin film: mean, and spread
     beside: tuple[float, float] = 0.85, 0.4  # that of the pia beside a thick one, and blur of where
-    waves: float = 0.027  # standard deviation of the slopes of its wall's waves
+    waves: float = 0.017  # standard deviation of the slopes of its wall's waves
     waves_mm: float = 0.16  # blur that makes them
 
 

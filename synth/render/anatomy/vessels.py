@@ -75,8 +75,8 @@ TRIBUTARIES = (
 ARTERIOLES = (
     Growth(spacing=3.2, reach=12.0, near=0.9, step=0.22, straight=3.0, end=(0.03, 0.04)),
     Growth(spacing=1.5, reach=5.0, near=0.45, step=0.16, straight=2.4, end=(0.03, 0.036)),
-    Growth(spacing=0.88, reach=2.5, near=0.24, step=0.12, straight=1.8, end=(0.027, 0.033)),
-    Growth(spacing=0.5, reach=1.5, near=0.16, step=0.1, straight=1.4, end=(0.025, 0.033)),
+    Growth(spacing=0.88, reach=2.5, near=0.24, step=0.12, straight=2.2, end=(0.022, 0.030)),
+    Growth(spacing=0.5, reach=1.5, near=0.16, step=0.1, straight=1.8, end=(0.017, 0.027)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
@@ -86,10 +86,10 @@ _TWIG_RADII = 5.0  # the more so, the wider what they leave
 _ROUNDED = 11  # rounds of smoothing of what has grown in, over some 0.2 mm: more straighten twigs
 _THIN_MM = 3.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.5  # length over which arterioles and tributaries thin
-_POINTED = 0.026, 0.06  # radius of a free end, and by how much it grows with each mm from there
-_ENDS_MM, _ENDS = (0.0, 0.55, 1.1, 1.8), (0.018, 0.028, 0.056, 0.2)  # most radius before a free end
+_POINTED = 0.018, 0.04  # radius of a free end, and by how much it grows with each mm from there
+_ENDS_MM, _ENDS = (0.0, 0.55, 1.1, 1.8), (0.013, 0.023, 0.046, 0.2)  # most radius before a free end
 _WIDENS = 1.08  # times, at most and besides, from a node to the next one up
-_WINDING = 0.15, 1.9  # shift of fine vessels, and over what distance
+_WINDING = 0.12, 1.9  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
 _WIDEST_MM = 0.5  # radius that no artery of the pia reaches, whatever its branches sum up to
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
