@@ -41,6 +41,11 @@ _REDDENED_MM, _REDDENED = (
     9.0,
     np.array((0.08, 0.32, 0.38), np.float32),
 )  # reach of the tissue's tint; its depth
+_FLASH = (
+    0.12,
+    0.11,
+    0.6,
+)  # the band in which a blade shows the lamps: place across, width, share that scatters
 _BRIM = 0.93, 0.05, 0.35  # its edge: place of the dark line beside it, width, added light
 _CREST = 0.05, 0.08, 0.5  # its bright one: place across, width, share of it that scatters
 _COLLAR_MM = 0.9, 0.13  # length of the collar in which a coat begins, and width of the grooves beside it
@@ -221,6 +226,9 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
         polished = np.asarray(most * broken * ridge(texels.across - place, width), np.float32)
     if kind == "spatula":
         base = np.asarray(base * _sheen(texels), np.float32)
+        place, width, most = _FLASH
+        broken = np.clip(0.85 + 0.1 * lines + 0.15 * mottle, 0, 1) * texels.flat
+        polished = np.asarray(most * broken * ridge(_wandering(texels) - place, width), np.float32)
     base, bumps = _shaped(texels, coat, base, bumps)
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
     handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
@@ -243,8 +251,7 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
 def _sheen(texels: _Texels) -> Map:
     """Light (h, w, 3) that a flat blade mirrors, as a share of a lamp's: bent by hand, it shows the dark
     room and the bright field in soft bands along it, red near its tip, darkest beside its bright edges."""
-    wander = gaussian_filter1d(texels.blotch.mean(axis=0), 0.1 * texels.blotch.shape[1], mode="nearest")
-    turned = texels.across + 0.35 * wander / max(float(wander.std()), 0.1) + 0.015 * texels.lines
+    turned = _wandering(texels) + 0.015 * texels.lines
     dark = sum(depth * ridge(turned - place, width) for place, width, depth in _BLADE)
     place, width, bright = _BRIM
     aside = np.abs(texels.across)
@@ -252,6 +259,12 @@ def _sheen(texels: _Texels) -> Map:
     light = np.clip(1 - dark, 0.2, 1) + brim * texels.flat
     near = np.exp(-texels.along / _REDDENED_MM)
     return np.asarray(light[..., None] * (1 - near[..., None] * _REDDENED), np.float32)
+
+
+def _wandering(texels: _Texels) -> Map:
+    """Place (h, w) across a blade from about -1 to 1, shifted as it is bent along it."""
+    wander = gaussian_filter1d(texels.blotch.mean(axis=0), 0.1 * texels.blotch.shape[1], mode="nearest")
+    return np.asarray(texels.across + 0.35 * wander / max(float(wander.std()), 0.1), np.float32)
 
 
 def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map) -> tuple[Map, Map]:

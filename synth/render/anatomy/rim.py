@@ -213,44 +213,71 @@ def build(
     extent = 2 * (radius_mm * 1.25 + _WIDTH_MM)
     lumps = noise.sample(noise.band(rng, 256, extent, 3.5, 0.6), flat, extent).reshape(away.shape)
     asides = np.stack([_aside(angle, stitch) for stitch in stitches]) * float(edge.mean())
-    dura = _uneven(rng, angle, *Dura.width) + Dura.pulled[0] * ridge(asides, Dura.pulled[1]).max(axis=0)
-    # Sawn bone and retracted muscle know nothing of the dura's corners, which may lie on them.
-    wide = around * Wound.smooth / (2 * np.pi)
-    wall = gaussian_filter1d(edge + dura, wide, mode="wrap") - edge + _wave(rng, angle, *Wound.gutter)
-    wall = np.maximum(wall, 0.8)
+    ends = _outlines(rng, appearance, angle, edge, asides)
     bone = "bone" in appearance.scenery
-    clipped = "clips" in appearance.scenery or "hooks" in appearance.scenery
-    skin = wall + Skin.boned * bone + _wave(rng, angle, *(Skin.clipped if clipped else Skin.away))
-    cloth = wall + _wave(rng, angle, *Drape.away)
-    cloth = np.maximum(cloth, skin + Drape.beyond) if "drape" in appearance.scenery else np.zeros(0)
-    if len(cloth):
-        cloth = _towels(appearance, angle, edge + cloth, edge + wall + Drape.over_wall) - edge
-    high, reach = Dura.tent
-    tents = high * ridge(asides[..., None], reach).max(axis=0) * ridge(away, at=0.8, width=reach)
-    outer = np.clip(away, 0, None)
-    raised = np.where(away > 0, tents + Dura.slope * outer + 0.15 * np.minimum(outer, 1) * lumps, 0)
-    beyond = step((away - dura[:, None]) / 0.5 - 0.4)
-    past = away - wall[:, None]
-    over_mm, start = (Bone.tables[2], 0.5) if bone else Wound.steep
-    wound = (Bone.rise if bone else Wound.rise) * step(past / over_mm - start)
-    wound = wound + Wound.floor - CutEdge.top[1] + (0.08 if bone else 0.25) * lumps
-    wound = wound + Skin.roll * ridge(away - skin[:, None], 1.1, at=0.5)
-    if len(cloth):
-        wound = wound + step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
-    z = _under(surface, flat).reshape(away.shape) + up + over(raised, wound, beyond)
+    z = _under(surface, flat).reshape(away.shape) + up + _relief(ends, bone, away, asides, lumps)
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     painted = edge[:, None] + np.concatenate([CutEdge.painted, away[0, len(CutEdge.painted) :]])[None]
     faces = grid_faces(around, away.shape[1], "rows").reshape(-1, 3)
     half = min(extent / 2, seen_mm)  # a map continues beyond its border
     uv = (_places(angle, painted).reshape(-1, 2) / (2 * half) + 0.5).astype(np.float32)
     rng = np.random.default_rng([appearance.rim_seed, 7])
-    crease, end = _flaps(rng, angle, dura)
+    crease, end = _flaps(rng, angle, ends.dura)
     held = rng.random(len(stitches)) < Flap.held
     bare = np.maximum(_wave(rng, angle, *Bone.bare), Bone.tables[2] + 1)
     held &= appearance.family != "calf"  # the dura of a specimen is not sewn back
-    return Rim(
-        Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, bare, skin, cloth
+    beyond = ends.wall, bone, bare, ends.skin, ends.cloth
+    return Rim(Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, *beyond)
+
+
+@dataclass(frozen=True)
+class _Outlines:
+    """Ends or starts of the layers around an opening, (A,) mm beyond its edge; no `cloth` without drapes."""
+
+    dura: Floats
+    wall: Floats
+    skin: Floats
+    cloth: Floats
+
+
+def _outlines(
+    rng: np.random.Generator, appearance: Appearance, angle: Floats, edge: Floats, asides: Floats
+) -> _Outlines:
+    """The outlines at angles (A,); `asides`: (n, A) mm along the edge from each stitch."""
+    dura = _uneven(rng, angle, *Dura.width) + Dura.pulled[0] * ridge(asides, Dura.pulled[1]).max(axis=0)
+    # Sawn bone and retracted muscle know nothing of the dura's corners, which may lie on them.
+    wide = len(angle) * Wound.smooth / (2 * np.pi)
+    wall = gaussian_filter1d(edge + dura, wide, mode="wrap") - edge + _wave(rng, angle, *Wound.gutter)
+    wall = np.maximum(wall, 0.8)
+    clipped = "clips" in appearance.scenery or "hooks" in appearance.scenery
+    boned = Skin.boned * ("bone" in appearance.scenery)
+    skin = wall + boned + _wave(rng, angle, *(Skin.clipped if clipped else Skin.away))
+    cloth = wall + _wave(rng, angle, *Drape.away)
+    if "drape" not in appearance.scenery:
+        return _Outlines(dura, wall, skin, np.zeros(0))
+    cloth = edge + np.maximum(cloth, skin + Drape.beyond)
+    return _Outlines(
+        dura, wall, skin, _towels(appearance, angle, cloth, edge + wall + Drape.over_wall) - edge
     )
+
+
+def _relief(ends: _Outlines, bone: bool, away: Floats, asides: Floats, lumps: Map) -> Floats:
+    """Height (A, R) mm over its cut edge of a rim with such ends, `away` (A, R) mm from the edge.
+
+    `asides`: as of `_outlines`; `lumps`: (A, R) noise.
+    """
+    high, reach = Dura.tent
+    tents = high * ridge(asides[..., None], reach).max(axis=0) * ridge(away, at=0.8, width=reach)
+    outer = np.clip(away, 0, None)
+    raised = np.where(away > 0, tents + Dura.slope * outer + 0.15 * np.minimum(outer, 1) * lumps, 0)
+    past = away - ends.wall[:, None]
+    over_mm, start = (Bone.tables[2], 0.5) if bone else Wound.steep
+    wound = (Bone.rise if bone else Wound.rise) * step(past / over_mm - start)
+    wound = wound + Wound.floor - CutEdge.top[1] + (0.08 if bone else 0.25) * lumps
+    wound = wound + Skin.roll * ridge(away - ends.skin[:, None], 1.1, at=0.5)
+    if len(ends.cloth):
+        wound = wound + step((away - ends.cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
+    return np.asarray(over(raised, wound, step((away - ends.dura[:, None]) / 0.5 - 0.4)))
 
 
 def _towels(appearance: Appearance, angle: Floats, reach: Floats, least: Floats) -> Floats:
@@ -435,32 +462,8 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     dura = through(dura, bloody * (1 - 0.7 * section), Wound.blood)
     dura = through(dura, turned * step(crease / 0.1) * np.exp(-np.abs(crease) / 0.35), Flap.shadow)
     colour = over(dura, np.asarray(CutEdge.albedo, np.float32), section[..., None])
-    bundles = _bundles(streaks, float(rim.stitches[0]), x, y, wide, mottle)
-    beyond, relief = _muscle(appearance, bundles, wide, mottle, spilt, fine)
-    beyond = through(beyond, 0.25 * soaked, Wound.blood)
-    wiped = np.clip(0.3 * bundles + 0.8 * wide + 0.15 * mottle + 1.2 * appearance.blood - 1.2, 0, 1.2)
-    tight = np.zeros_like(away)  # share of bone and skin, which soak up no fluid
-    if rim.bone:
-        beyond, relief, tight = _with_bone(
-            (beyond, relief),
-            past,
-            _round(rim.bare, angle),
-            wiped,
-            appearance.blood,
-            wide,
-            mottle,
-            grain,
-            fine,
-        )
-    beyond, relief, skin = _with_skin(
-        (beyond, relief), away - _round(rim.skin, angle), wiped, appearance.blood, mottle, grain, fine
-    )
-    most, level = Blood.flood
-    lower = np.cos(angle - float(rim.stitches[-1])) + 0.45 * wide + 0.1 * mottle + 2 * appearance.blood
-    flood = most * np.clip(lower - 1 - level, 0, 1) * np.clip(1.4 - 0.12 * past, 0, 1)
-    beyond = through(beyond, np.minimum(flood, 6 * appearance.blood), Wound.blood)
+    beyond, relief, tight = _beyond(rim, appearance, streaks, (angle, away, past), soaked, *maps)
     run = np.clip((away - reach) / Blood.runs + 0.3 * mottle, 0, 3)
-    tight = np.maximum(tight, skin)
     beyond = through(beyond, depth * pool * np.exp(-run) * (1 - tight), Wound.blood)
     colour = over(colour, beyond, outer[..., None])
     colour = through(colour, np.clip(-away - 1.2, 0, 1), CutEdge.shadow)
@@ -488,6 +491,43 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         colour, bumps = _threaded(across, away, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
+
+
+def _beyond(
+    rim: Rim, appearance: Appearance, streaks: Map, place: tuple[Map, Map, Map], soaked: Map, *maps: Map
+) -> tuple[Map, Map, Map]:
+    """Albedo (r, n, 3), bumps (r, n) mm and the share of bone and skin, which soak up no fluid, beyond the
+    dura's end.
+
+    `place`: angle, distance from the opening's edge and from the wall's foot; others as of `_paint_rows`.
+    """
+    x, y, wide, mottle, grain, spilt, _, fine = maps
+    angle, away, past = place
+    bundles = _bundles(streaks, float(rim.stitches[0]), x, y, wide, mottle)
+    beyond, relief = _muscle(appearance, bundles, wide, mottle, spilt, fine)
+    beyond = through(beyond, 0.25 * soaked, Wound.blood)
+    wiped = np.clip(0.3 * bundles + 0.8 * wide + 0.15 * mottle + 1.2 * appearance.blood - 1.2, 0, 1.2)
+    tight = np.zeros_like(away)
+    if rim.bone:
+        beyond, relief, tight = _with_bone(
+            (beyond, relief),
+            past,
+            _round(rim.bare, angle),
+            wiped,
+            appearance.blood,
+            wide,
+            mottle,
+            grain,
+            fine,
+        )
+    beyond, relief, skin = _with_skin(
+        (beyond, relief), away - _round(rim.skin, angle), wiped, appearance.blood, mottle, grain, fine
+    )
+    most, level = Blood.flood
+    lower = np.cos(angle - float(rim.stitches[-1])) + 0.45 * wide + 0.1 * mottle + 2 * appearance.blood
+    flood = most * np.clip(lower - 1 - level, 0, 1) * np.clip(1.4 - 0.12 * past, 0, 1)
+    beyond = through(beyond, np.minimum(flood, 6 * appearance.blood), Wound.blood)
+    return beyond, relief, np.maximum(tight, skin)
 
 
 def _fibres(streaks: Map, angle: Map, away: Map, radius: float) -> Map:

@@ -91,6 +91,8 @@ class Vein:
     margin: float = 0.8  # blur
     margin_dark: Rgb = (0.36, 0.85, 0.62)  # absorption
     crest: float = 0.5  # of a thick one's radius: width of its bluish crest
+    pale: Rgb = (0.66, 0.56, 0.66)  # albedo of the sheen along it, beside the highlight,
+    gleam: tuple[float, float, float] = 0.42, 0.22, 0.34  # its share: mean, spread; its width in radii
     rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
     rim_dark: Rgb = (0.8, 1.15, 0.85)  # absorption
     mottle: float = 0.14  # standard deviation of its wall's albedo, as a share of it
@@ -104,7 +106,7 @@ class Vein:
     # nearly all, so that the highlight never ends; the wall's long waves vary its width
     dry: tuple[float, float] = 0.8, 0.2  # share of a thick one's crest under a thin film: mean, and spread
     beside: tuple[float, float] = 0.85, 0.4  # that of the pia beside a thick one, and blur of where
-    waves: float = 0.017  # standard deviation of the slopes of its wall's waves
+    waves: float = 0.012  # standard deviation of the slopes of its wall's waves
     waves_mm: float = 0.16  # blur that makes them
 
 
@@ -302,6 +304,9 @@ def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
+    mean, spread, width = Vein.gleam
+    gleam = np.clip(mean - spread * along, 0, 0.8) * thick * ridge(across, width=width)
+    wall = over(wall, np.array(Vein.pale, np.float32), gleam[..., None])
     middle, width = Vein.rim
     wall = wall * (1 + Vein.mottle * along + Vein.fibres[1] * fibres)[..., None]
     wall = through(wall, thick * ridge(across, width=width, at=middle), Vein.rim_dark)
