@@ -7,7 +7,8 @@
 #   make guard   by how much this checkout's values differ from the stored ones, a minute; ACCEPT=1 stores them
 #   make docs    the pages in site/; open site/index.html
 #   make weights  trains the networks again, from nothing, into runs/weights/made: of motion, then `stereo`; many hours
-#   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
+#   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the
+#                   appearance, JOBS=2 studies at a time
 #   make clean   removes all of the above
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
@@ -108,7 +109,7 @@ weights: setup
 	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo epochs=60 surface_motion_mm=0.7 -o $(WEIGHTS)/made/stereo
 
 evidence: setup
-	$(BIN)/python -m evidence all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \
+	$(BIN)/python -m evidence all runs/evidence $(if $(JOBS),--jobs $(JOBS)) $(if $(PHOTO),--photo $(PHOTO)) \
 	  $(if $(MECHANICS_PYTHON),--mechanics-python $(MECHANICS_PYTHON)) $(if $(PICTURES_PYTHON),--pictures-python $(PICTURES_PYTHON))
 
 lint: setup
