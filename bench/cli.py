@@ -142,6 +142,8 @@ def estimate(
 ) -> None:
     """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
 
+    The first frame shows the tissue unloaded, by one camera; `bench score` takes two, or another rest frame.
+
     Exit code 2 if no frame has a force.
     """
     from threadpoolctl import threadpool_limits

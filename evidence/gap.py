@@ -384,12 +384,12 @@ def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
             continue
         words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap"
         if "S" in kinds:
-            words[-1] += f", the control {_closed(closes['S'])}"
+            words[-1] += f", the control, which learns to answer zero, {_closed(closes['S'])}"
         if "N" in kinds:
             low, high = (100 * end for end in at_place["noise_less_real"][1:])
             words[-1] += (
-                f", with fitted noise {_closed(closes['N'])} (its error less that after recovered flow: "
-                f"{low:.2g} to {high:.2g} percentage points)"
+                f", fitted noise {_closed(closes['N'])} (that network errs {low:.2g} to {high:.2g} "
+                "percentage points more than the one trained on recovered flow)"
             )
         words[-1] += "."
         if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
