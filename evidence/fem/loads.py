@@ -67,8 +67,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
 
 def _spread(values: list[float]) -> str:
-    low, middle, high = np.percentile(values, _RANGE)
-    return report.mean_cell([middle, low, high], ".2g")
+    low, middle, high = (f"{float(f'{value:.2g}'):g}" for value in np.percentile(values, _RANGE))
+    return f"{middle} [{low}, {high}]"
 
 
 STUDY = Study(measure, "fem/loads/loads.json", page, needs=("mesh", "mechanics"))
