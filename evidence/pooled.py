@@ -18,11 +18,8 @@ from synth.system import checked_file
 # Options of `bench score` by number of cameras: with two a pretrained network is scored next to physics.
 _OPTIONS = {1: (), 2: ("--model", "stereo", "--main", PHYSICS)}
 FOLDERS = {1: "monocular", 2: "stereo"}  # of the results, likewise
+RIGHT = "right.mp4", "pair.yaml"  # files of a recording's right camera: its video and the calibration
 _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers, which the page counts
-
-
-RIGHT = "right.mp4", "pair.yaml"
-"""Files of a recording's right camera: its video and the calibration."""
 
 
 def copy_left(both: Path, left: Path) -> None:

@@ -95,6 +95,29 @@ def test_a_failed_step_does_not_stop_the_next(tmp_path: Path) -> None:
     assert "why" in (tmp_path / "bad.log").read_text()
 
 
+def test_studies_run_side_by_side_and_those_that_hold_times_last(tmp_path: Path) -> None:
+    meet = (
+        "import pathlib, sys, time\n"
+        "pathlib.Path({0!r}).touch()\n"
+        "for _ in range(200):\n"
+        "    if pathlib.Path({1!r}).exists(): sys.exit(0)\n"
+        "    time.sleep(0.1)\n"
+        "sys.exit(1)"
+    )
+    first, second = (str(tmp_path / name) for name in "ab")
+    after = f"import pathlib, sys; sys.exit(not all(pathlib.Path(f).exists() for f in {[first, second]}))"
+    steps = [
+        ("fem.pareto", ("-c", after)),  # it holds times
+        ("fem.relief", ("-c", meet.format(first, second))),  # each waits for the other
+        ("fem.loads", ("-c", meet.format(second, first))),
+    ]
+    rows = run_steps(steps, tmp_path / "logs", jobs=2)
+    assert {row["name"]: row["exit_code"] for row in rows} == dict.fromkeys(
+        ("fem.relief", "fem.loads", "fem.pareto"), 0
+    )
+    assert rows[-1]["name"] == "fem.pareto"
+
+
 def test_only_results_that_moved_are_made_again(tmp_path: Path) -> None:
     steps, _ = everything.plan(tmp_path, {}, "fem", left={"fem.pareto"})
     assert {name for name, _ in steps} == {"fem.relief", "fem.loads"}

@@ -17,6 +17,7 @@ from bench.recording import recording_writer
 from bench.recording.recording_folder import open_recording
 from bench.tracking.tracking import track_recording
 from evidence.curves.models import coarser
+from evidence.pooled import copy_left
 from evidence.scoring import degradations, exvivo, stability
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView
@@ -41,6 +42,11 @@ def test_a_stereo_stand_in_fits_its_calibration(tmp_path: Path, monkeypatch: pyt
     assert done.stereo.epipolar_px < 0.3, "the calibration fits the images"
     apart = np.abs(left[0].rgb.astype(int) - right[0].rgb.astype(int)).mean()
     assert apart > 4, "the cameras are in different places"
+    copy_left(tmp_path / "000", tmp_path / "left")
+    alone = open_recording(tmp_path / "left")
+    assert alone.meta.stereo is None
+    assert alone.meta.scale_mm_per_px == recording.meta.scale_mm_per_px
+    np.testing.assert_array_equal([frame.rgb for frame in alone.frames()], [frame.rgb for frame in left])
 
 
 @pytest.mark.trial

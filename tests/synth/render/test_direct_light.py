@@ -92,6 +92,20 @@ def test_tissue_scatters_light_into_shadows_and_steel_does_not(spp: int) -> None
     assert gain[26, 0] > 1.5 * gain[26, 1] >= gain[26, 2] > 0
 
 
+def test_the_outline_of_steel_is_no_row_of_beads() -> None:
+    """A thin shadow beside steel, in every other pixel: evened along the outline, untouched elsewhere."""
+    steel, none = np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32)
+    steel[:, :32], steel[:, 32] = 1, 0.5
+    radiance = np.stack([np.where(np.mgrid[:64, :64][1] < 32, 0.3, 0.7).astype(np.float32)] * 3)
+    radiance[:, ::2, 32], radiance[:, 1::2, 32] = 0.1, 0.7
+    soft = soften(Light(radiance, 0 * radiance, none, 0 * radiance, none, none + 1, none, steel), 4)
+    inner = soft[8:-8, :, 0]
+    assert np.ptp(inner[:, 32]) < 0.15 < np.ptp(radiance[0, 8:-8, 32])
+    assert inner[:, 32].mean() == pytest.approx(0.4, abs=0.02)
+    apart = np.r_[8:30, 35:56]
+    np.testing.assert_allclose(inner[:, apart], radiance[0, 8:-8][:, apart], atol=1e-6)
+
+
 def test_noise_falls_where_a_wide_rim_crosses_a_shadow() -> None:
     """Under two unequal lamps, each sampled by half of a pixel's paths; not below what texture adds."""
     rng, before, after = np.random.default_rng(5), [], []

@@ -112,6 +112,26 @@ def test_tissue_is_visible_through_the_opening_only() -> None:
         assert (np.hypot(points[0], points[1]) < opening + 1.0).all()
 
 
+def test_drapes_have_straight_hems_behind_the_wound() -> None:
+    job = Job(
+        seed=5, anatomy=AnatomySection(vertices=6000), render={"size": (192, 144), "scenery": ["drape"]}
+    )
+    scene = at_rest(job)
+    built = rim.build(
+        scene.surface, job.anatomy.craniotomy.radius_mm, scene.scenario.appearance, scene.view.mm_per_px
+    )
+    assert (built.cloth >= built.wall + rim.Drape.over_wall - 1e-9).all()
+    turn = 2 * np.pi * np.arange(len(built.edge)) / len(built.edge)
+    hem = (built.edge + built.cloth) * np.exp(1j * turn)
+    ahead = np.diff(np.append(hem, hem[0]))
+    bends = np.abs(np.angle(np.roll(ahead, -1) / ahead))
+    assert np.mean(bends < 1e-6) > 0.5, "most of it lies on a few straight lines"
+    bare = job.model_copy(update={"render": job.render.model_copy(update={"scenery": ()})})
+    other = at_rest(bare)
+    drawn = other.scenario.appearance
+    assert not len(rim.build(other.surface, 12.0, drawn, other.view.mm_per_px).cloth)
+
+
 def test_traction_is_in_camera_axes() -> None:
     ours, vertices = made(VARIANTS[-1])
     nodal = np.zeros_like(vertices)
