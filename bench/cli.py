@@ -136,13 +136,15 @@ def estimate(
     flow: Backend = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
     rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
+    rest: Annotated[int, Option(min=0, help="Number of the frame in which the tissue is unloaded.")] = 0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     json: Json = False,
 ) -> None:
     """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
 
-    The first frame shows the tissue unloaded, by one camera; `bench score` takes two, or another rest frame.
+    The video is of one camera (`bench score` takes two), and its first frame, or --rest, shows the tissue
+    unloaded.
 
     Exit code 2 if no frame has a force.
     """
@@ -156,7 +158,7 @@ def estimate(
     from synth.video.pixel_scale import read_scale
 
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
-    options = read_options(read_scale(scale), tissue, masks, settings)
+    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest)
     threadpool_limits(choose_threads())
     by_physics = partial(
         apply_physics,

@@ -214,6 +214,7 @@ def predict_command(
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
     rate: Annotated[float, Option(min=0.0, help="Most frames per second of a video; 0: all.")] = 10.0,
+    rest: Annotated[int, Option(min=0, help="Number of a video's frame in which tissue is unloaded.")] = 0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion.")] = True,
     masks: Annotated[
         str, Option(help="Of a video: auto, none, or a folder of NNNNNN.png or mask.png.")
@@ -235,7 +236,7 @@ def predict_command(
     from synth.video.pixel_scale import read_scale
 
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
-    options = read_options(read_scale(scale), tissue, masks, settings)
+    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest)
     predicted = []
     predictor = load_model(model, threads=choose_threads(threads))
     each = motions(source, predictor.choose_source(input), options)

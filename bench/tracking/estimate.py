@@ -43,13 +43,13 @@ def estimate(
     shrink: int = 0,
     rate_hz: float | None = 10.0,
     fps: float = FPS,
+    rest_frame: int = 0,
     input: str | None = None,
 ) -> dict[str, Any]:
     """Forces of one video by physics, which needs no training, by the names of `bench estimate`'s NAME.npz.
 
     Args:
-        source: frames (T, H, W, 3) uint8 from the rest frame on, a video, a folder of PNGs, a sequence or an
-            .npz of flow.
+        source: frames (T, H, W, 3) uint8, a video, a folder of PNGs, a sequence or an .npz of flow.
         scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia).
@@ -62,6 +62,7 @@ def estimate(
         shrink: factor by which a video is downsampled before flow; 0: to 320 columns.
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
+        rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
         input: displacement read from a sequence: recovered or ideal, with two cameras motion or motion-ideal.
 
     Returns:
@@ -73,7 +74,7 @@ def estimate(
     """
     source = Path(source) if isinstance(source, str) else source
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
-    options = read_options(scale_mm_per_px, tissue, masks, settings, fps)
+    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame)
     motion = read_only(source, motions(source, choose_input(source, input), options))
     return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, options.given)
 

@@ -39,13 +39,13 @@ def predict(
     shrink: int = 0,
     rate_hz: float | None = 10.0,
     fps: float = FPS,
+    rest_frame: int = 0,
     input: str | None = None,
 ) -> dict[str, Any]:
     """Forces of one video by a network, as `learn predict` estimates them, by the names of its NAME.npz.
 
     Args:
-        source: frames (T, H, W, 3) uint8 from the rest frame on, a video, a folder of PNGs, a sequence or an
-            .npz of flow.
+        source: frames (T, H, W, 3) uint8, a video, a folder of PNGs, a sequence or an .npz of flow.
         model: from `load_model`, its folder or the name of a pretrained one.
         scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
@@ -57,6 +57,7 @@ def predict(
         shrink: factor by which a video is downsampled before flow; 0: to 320 columns.
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
+        rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
         input: displacement read from a sequence, as of `learn predict`.
 
     Raises:
@@ -64,7 +65,7 @@ def predict(
     """
     source = Path(source) if isinstance(source, str) else source
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
-    options = read_options(scale_mm_per_px, tissue, masks, settings, fps)
+    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame)
     predictor = model if isinstance(model, Predictor) else load_model(model)
     motion = read_only(source, motions(source, predictor.choose_source(input), options))
     return apply(predictor, motion, young_kpa, membrane)

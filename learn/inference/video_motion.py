@@ -53,6 +53,7 @@ class VideoOptions:
     settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
     tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
     fps: float = video.FPS  # of pictures without times
+    rest_frame: int = 0  # number of the frame in which tissue is unloaded; earlier ones are left out
 
     @property
     def given(self) -> tuple[bool, bool]:
@@ -66,13 +67,16 @@ def read_options(
     masks: str | Path | Array,
     settings: RecordingFlowSettings,
     fps: float = video.FPS,
+    rest_frame: int = 0,
 ) -> VideoOptions:
     """The options of a video from the arguments of `learn.predict` and `bench.estimate`, and of the commands;
     UserError if one is out of range. The masks' kind replaces that of the settings."""
     as_positive("fps", fps)
+    if rest_frame < 0:
+        raise UserError(f"rest_frame {rest_frame}: the number of a frame, from 0")
     kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
     tissue = Path(tissue) if isinstance(tissue, str) else tissue
-    return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps)
+    return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps, rest_frame)
 
 
 def read_only(source: Path | Array, each: Iterator[Motion]) -> Motion:
@@ -88,11 +92,15 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
-    instead of flow and confidence. Raises UserError for anything else, and for a video without a scale.
+    instead of flow and confidence. Raises UserError for anything else, for a video without a scale, and for a
+    rest frame of what starts at rest.
     """
     if isinstance(path, np.ndarray) or video.is_video(path):
         yield _video(path, options or VideoOptions())
-    elif path.suffix == ".npz":
+        return
+    if options is not None and options.rest_frame:
+        raise UserError(f"rest_frame {options.rest_frame}: only of a video; {path} starts at rest")
+    if path.suffix == ".npz":
         yield _arrays(path)
     else:
         for sequence in _sequences(path):
@@ -165,7 +173,7 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tool = options.tool.of_frames(range(count or 0), taken).read
     elif options.tool is not None:
         tool = partial(_mask, "masks", options.tool)
-    footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool)
+    footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool, options.rest_frame)
     track = track_video(footage, options.settings)
     rest, findings = track.video.rest, track.video.findings
     scale = pixel_mm(options.scale_mm_per_px, rest.size[1])

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,9 +11,12 @@ from command import run
 from fake_model import write_model
 from fake_recording import Maker
 
+import bench
 import bench.cli
 import learn.cli
+import synth
 from bench.methods import comparison
+from synth.video.read_video import read_frames
 
 FPS, SIZE = 25.0, (96, 704)
 
@@ -51,6 +55,20 @@ def test_predict_and_score_agree_at_every_frame(
             assert found["force_mn"] == pytest.approx(axes, rel=1e-6, abs=1e-8)
         assert found["young_kpa"] == (young or 1.0)
         assert bool(found["young_known"]) == (young is not None)
+
+
+@pytest.mark.slow
+def test_a_rest_frame_leaves_out_what_comes_before(make: Maker, tmp_path: Path) -> None:
+    path = make(frames=16, footage="mp4") / "video.mp4"
+    frames = np.stack([picture.rgb for picture in read_frames(path, FPS)])
+    about: dict[str, Any] = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "living": False, "rate_hz": None}
+    about |= {"tissue": np.full(frames.shape[1:3], True), "masks": "none", "membrane": "stripped"}
+    late, cut = bench.estimate(frames, rest_frame=3, **about), bench.estimate(frames[3:], **about)
+    assert late["frame"].tolist() == (cut["frame"] + 3).tolist()
+    assert late["total_force_mn"] == pytest.approx(cut["total_force_mn"], rel=1e-6)
+    assert late["total_force_mn"].max() > 0
+    with pytest.raises(synth.UserError, match="rest_frame"):
+        bench.estimate(next(iter(synth.sample())).path, rest_frame=1)
 
 
 @pytest.mark.slow

@@ -115,6 +115,8 @@ def predict_force(*given: Any) -> Any:
         ("scale", lambda: bench.estimate(GREY)),
         ("young_kpa", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE, young_kpa=-1.0)),
         ("tissue", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE[0])),
+        ("rest_frame", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE, rest_frame=-1)),
+        ("rest_frame", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE, rest_frame=99)),
     ],
 )
 def test_an_invalid_argument_is_refused_by_name(named: str, call: Callable[[], object]) -> None:
