@@ -63,7 +63,7 @@ def measure(
     clinical: Path,
     recordings: Path,
     work: Path = Path("runs/gap"),
-    fit: int = 240,
+    fit: int = 375,
     epochs: int = 96,
     seeds: int = 1,
     kinds: str = ",".join(KINDS),
