@@ -20,7 +20,10 @@ from synth.render.materials import FinishMaps
 
 RING = 32  # vertices of each of a closed bar's rings
 _ACROSS = 24, 224  # rows of texels, least and most
-_MOST_ALONG = {"spatula": 1600}  # columns of a bar's; 640 of others: a wide blade would show them
+_COLUMNS, _BLADE_COLUMNS = (
+    (4, 640),
+    (8, 1600),
+)  # of a bar's, by its rows and at most: a wide blade would show few
 _WIDE_MM = 5.0  # of a usual part's shown half, by which the texels are as large as the picture's pixels
 _PLASTIC = np.full(3, 0.04, np.float32)  # reflectance at right angles, at an index of 1.5
 _BLOOD = np.array([0.20, 0.006, 0.005], np.float32)  # albedo of a clot
@@ -37,15 +40,10 @@ _ROUNDED = 0.55, 2.6  # light that a coat lacks at a shaft's sides, and the powe
 _GLINTS = (0.1, 0.10, 0.42), (-0.62, 0.05, 0.10), (0.9, 0.05, 0.12)  # on a coat: place across, width, light
 _BANDS = (0.46, 0.18, 0.45), (-0.4, 0.2, 0.5), (0.98, 0.08, 0.3), (-0.98, 0.08, 0.3)  # dark ones on steel
 _BLADE = (0.7, 0.5, 0.55), (-0.8, 0.4, 0.5), (-0.15, 0.1, 0.12)  # dark bands on a flat blade
-_REDDENED_MM, _REDDENED = (
-    9.0,
-    np.array((0.08, 0.32, 0.38), np.float32),
-)  # reach of the tissue's tint; its depth
-_FLASH = (
-    0.12,
-    0.11,
-    0.6,
-)  # the band in which a blade shows the lamps: place across, width, share that scatters
+_REDDENED_MM = 9.0  # reach of the tissue's tint on a blade,
+_REDDENED = np.array((0.08, 0.32, 0.38), np.float32)  # and its depth
+# The band in which a blade shows the lamps: place across, width, share that scatters.
+_FLASH = 0.12, 0.11, 0.6
 _BRIM = 0.93, 0.05, 0.35  # its edge: place of the dark line beside it, width, added light
 _CREST = 0.05, 0.08, 0.5  # its bright one: place across, width, share of it that scatters
 _COLLAR_MM = 0.9, 0.13  # length of the collar in which a coat begins, and width of the grooves beside it
@@ -180,7 +178,8 @@ def _lay_out(
         body = rings[len(rings) // 3, shown]
         outline = float(np.linalg.norm(np.diff(body, axis=0), axis=1).sum())
         height = int(np.clip(max(_WIDE_MM, 0.9 * outline) / mm_per_px, *_ACROSS))
-        size = height, min((8 if kind == "spatula" else 4) * height, _MOST_ALONG.get(kind, 640))
+        share, most = _BLADE_COLUMNS if kind == "spatula" else _COLUMNS
+        size = height, min(share * height, most)
         rows = np.interp(np.linspace(0, 1, height), _share_of_outline(rings[:, shown]), np.arange(len(shown)))
         place = _texels(rings[:, shown].swapaxes(0, 1), size, rows)
         turned = _texels(_edges(rings)[:, shown].T[..., None], size, rows)
@@ -221,14 +220,11 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
         # The dark room beside the lamps and the light between them, as on any round shaft under a microscope.
         dark = sum(depth * ridge(texels.across - place, width) for place, width, depth in _BANDS)
         base = np.asarray(base * (1 - dark * texels.flat)[..., None], np.float32)
-        place, width, most = _CREST
-        broken = np.clip(0.8 + 0.2 * lines + 0.2 * mottle, 0, 1) * texels.flat
-        polished = np.asarray(most * broken * ridge(texels.across - place, width), np.float32)
+        polished = _polished(texels, texels.across, _CREST, 0.8 + 0.2 * lines + 0.2 * mottle)
     if kind == "spatula":
-        base = np.asarray(base * _sheen(texels), np.float32)
-        place, width, most = _FLASH
-        broken = np.clip(0.85 + 0.1 * lines + 0.15 * mottle, 0, 1) * texels.flat
-        polished = np.asarray(most * broken * ridge(_wandering(texels) - place, width), np.float32)
+        across = _wandering(texels)
+        base = np.asarray(base * _sheen(texels, across), np.float32)
+        polished = _polished(texels, across, _FLASH, 0.85 + 0.1 * lines + 0.15 * mottle)
     base, bumps = _shaped(texels, coat, base, bumps)
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
     handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
@@ -248,10 +244,20 @@ def _body(finish: Finish, texels: _Texels) -> _Layers:
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
 
 
-def _sheen(texels: _Texels) -> Map:
+def _polished(texels: _Texels, across: Map, band: tuple[float, float, float], broken: Map) -> Map:
+    """Share (h, w) of light that a bright `band` scatters: its place `across`, width and most."""
+    place, width, most = band
+    whole = np.clip(broken, 0, 1) * texels.flat
+    return np.asarray(most * whole * ridge(across - place, width), np.float32)
+
+
+def _sheen(texels: _Texels, across: Map) -> Map:
     """Light (h, w, 3) that a flat blade mirrors, as a share of a lamp's: bent by hand, it shows the dark
-    room and the bright field in soft bands along it, red near its tip, darkest beside its bright edges."""
-    turned = _wandering(texels) + 0.015 * texels.lines
+    room and the bright field in soft bands along it, red near its tip, darkest beside its bright edges.
+
+    `across`: as of `_wandering`.
+    """
+    turned = across + 0.015 * texels.lines
     dark = sum(depth * ridge(turned - place, width) for place, width, depth in _BLADE)
     place, width, bright = _BRIM
     aside = np.abs(texels.across)
@@ -362,9 +368,9 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     level, reach, thin = _SMEARED
     wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
     deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
-    # In cloth blood is soaked up, and its threads show.
     if texels.kind == "spatula":  # on a smooth blade it is wiped to a thin film, thicker along its border
         deep = _THINNED * deep * np.clip(0.9 + 0.1 * texels.lines + 0.35 * texels.mottle, 0.2, 1.6)
+    # In cloth blood is soaked up, and its threads show.
     film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5) * (not texels.sheet)
     if texels.sheet:
         deep = np.clip(deep * (0.6 + 0.3 * texels.mottle), 0, _DRUNK)
