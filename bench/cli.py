@@ -130,6 +130,11 @@ def estimate(
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
     ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
+    right: Annotated[Path | None, Option(help="The same video by a second camera, to the right.")] = None,
+    calibration: Annotated[
+        Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
+    ] = None,
+    mm_per_unit: Annotated[float, Option(min=1e-9, help="Of the calibration's T.")] = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     masks: Masks = "auto",
     input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,
@@ -143,8 +148,8 @@ def estimate(
 ) -> None:
     """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
 
-    The video is of one camera (`bench score` takes two), and its first frame, or --rest, shows the tissue
-    unloaded.
+    The video's first frame, or --rest, shows the tissue unloaded. With a second camera (--right) force along
+    the line of sight is measured as well.
 
     Exit code 2 if no frame has a force.
     """
@@ -152,13 +157,14 @@ def estimate(
 
     from bench.tracking.estimate import apply_physics, choose_input
     from learn.inference.prediction_file import predict_files, summarise
-    from learn.inference.video_motion import motions, read_options
+    from learn.inference.video_motion import SecondCamera, motions, read_options
     from learn.training.threads import choose_threads
     from synth.flow.recording.decode import RecordingFlowSettings
     from synth.video.pixel_scale import read_scale
 
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
-    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest)
+    second = SecondCamera.of(right, calibration, mm_per_unit)
+    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest, second=second)
     threadpool_limits(choose_threads())
     by_physics = partial(
         apply_physics,

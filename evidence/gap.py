@@ -3,7 +3,8 @@
 Trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the error of the
 recovered flow (N), and as a control recovered flow with another sequence's force (S). Each is tested on ideal
 and on recovered flow of held-out sequences, of an unseen appearance and anatomy, of clinical loads, and of
-recordings simulated and rendered by other programs.
+recordings simulated and rendered by other programs. Twice: by ridge regression, whose solution is unique, and
+by networks, which may not have converged.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from bench.recording.recording_folder import open_recording
 from bench.tracking.tracking import track_recording
 from evidence import report, result_cache, result_status, training
+from evidence.curves.models import fit_ridge_on_components
 from evidence.foreign.recordings import TRUTH
 from evidence.paired_means import difference, mean_of
 from evidence.pooled import FOLDERS
@@ -27,7 +29,7 @@ from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, GridView
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import Predictor
+from learn.inference.predict import Predictor, force_size
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
@@ -99,6 +101,11 @@ def measure(
     chosen = kinds.split(",")
     if not {"I", "R"} <= {*chosen} <= {*KINDS}:
         raise UserError(f"kinds {kinds!r}: I and R, and any of {', '.join(KINDS[2:])}")
+    force = {place: [_mean_force(clip) for clip in part] for place, part in tested.items()}
+    ridge = []
+    for size in (len(split.fit) // 4, len(split.fit) // 2, len(split.fit)):
+        by_kind = {kind: [ridge_errors(kind, clips, split.fit[:size], tests)] for kind in KINDS}
+        ridge.append({"fit": size} | summary(by_kind, force))
     trained: dict[str, list[Errors]] = {kind: [] for kind in chosen}
     curve: dict[str, list[list[float]]] = {}
     for seed in range(seeds):
@@ -108,7 +115,6 @@ def measure(
             trained[kind].append(made["errors"])
             curve.setdefault(kind, made["curve"])
     noise = fit_noise([clips[i] for i in split.fit])
-    force = {place: [_mean_force(clip) for clip in part] for place, part in tested.items()}
     sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
         "data": result_status.data(dataset, unseen, clinical),
@@ -117,6 +123,7 @@ def measure(
         "seeds": seeds,
         "noise": asdict(noise),
         "curve": {kind: curve[kind] for kind in ("I", "R")},
+        "ridge": ridge,
     } | summary(trained, force)
 
 
@@ -166,6 +173,39 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
 
 
+def known_to(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) -> list[Clip]:
+    """The clips as a training of `KINDS` knows them: S with other forces, N with noise for recovered flow,
+    fitted to those at `fit`."""
+    own = list(clips)
+    if kind == "S":
+        half = len(clips) // 2
+        others = [*clips[half:], *clips[:half]]
+        own = [
+            replace(clip, density=other.density, force=other.force)
+            for clip, other in zip(clips, others, strict=True)
+        ]
+    if kind == "N":
+        noise = fit_noise([clips[i] for i in fit])
+        for k, clip in enumerate(clips):
+            rng = np.random.default_rng([seed, k])
+            noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
+            own[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
+    return own
+
+
+def ridge_errors(kind: str, clips: Sequence[Clip], fit: Sequence[int], tests: Tests) -> Errors:
+    """Errors of ridge regression on the clips at `fit` as one of `KINDS`: of every test, those of its
+    sequences [mN]."""
+    own = known_to(kind, clips, fit, 0)
+    estimate = fit_ridge_on_components([own[i] for i in fit], _INPUTS[kind])
+    return {
+        test: [
+            float(np.abs(force_size(estimate(clip, source)) - force_size(clip.force)).mean()) for clip in part
+        ]
+        for test, (part, source) in tests.items()
+    }
+
+
 def errors(
     kind: str,
     clips: Sequence[Clip],
@@ -188,20 +228,7 @@ def errors(
         return [row[_KEY] for row in evaluate(predictor, part, source).per_clip()]
 
     def compute() -> dict[str, Any]:
-        own = list(clips)
-        if kind == "S":
-            half = len(clips) // 2
-            others = [*clips[half:], *clips[:half]]
-            own = [
-                replace(clip, density=other.density, force=other.force)
-                for clip, other in zip(clips, others, strict=True)
-            ]
-        if kind == "N":
-            noise = fit_noise([clips[i] for i in split.fit])
-            for k, clip in enumerate(clips):
-                rng = np.random.default_rng([settings.seed, k])
-                noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
-                own[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
+        own = known_to(kind, clips, split.fit, settings.seed)
         final, earlier = training.fit_with_epochs(name, own, split, settings, work / "models", _SHOWN, device)
         curve = []
         for epoch, predictor in earlier.items():
@@ -325,35 +352,14 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """The curve of the trainings, errors by place, and the tables."""
+    """The answers, the curve of the networks' trainings, and the tables of both estimators."""
     kinds = [kind for kind in KINDS if kind in found["errors"]]
-    words = _answer(found, kinds)
-    tables = []
-    for heading, errors, factor in (
-        ("Errors as shares of the mean force", found["errors"], 100.0),
-        ("Errors [mN]", found["errors_mn"], 1.0),
-    ):
-        rows = [
-            {"trained on": kind, "tested on": flow}
-            | {
-                name: report.mean_cell(tests[f"{place}, {flow}"], factor=factor)
-                for place, name in PLACES.items()
-            }
-            for kind, tests in errors.items()
-            for flow in (FLOWS if kind != NONE else FLOWS[:1])
-        ]
-        tables.append(report.Section(heading + (", in percent" if factor > 1 else ""), rows))
-    shares = [
-        {"training": kind}
-        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in PLACES.items()}
-        for kind in kinds[1:]
-    ]
+    ridge = found["ridge"][-1]
     count = ", ".join(f"{number} {name}" for name, number in found["sequences"].items())
     return report.Page(
         "Sim-to-real gap: training on recovered flow",
         found,
         (
-            *words,
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
             "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
@@ -364,9 +370,51 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "exceeds 100%, assuming no force is better. "
             "[The same question by four commands](../../howto/gap.md).",
         ),
-        [report.Section("Share of the gap closed", shares), *tables],
+        [
+            report.Section("Ridge regression: a unique solution, no seed", words=_answer(ridge, KINDS)),
+            *_tables(ridge, KINDS),
+            report.Section("Share closed by ridge regression, against fitted sequences", _sizes(found)),
+            report.Section(
+                f"D2FNet, after {found['settings']['epochs']} epochs", words=_answer(found, kinds)
+            ),
+            *_tables(found, kinds),
+        ],
         report.chart(partial(_draw_curve, curve=found["curve"]), width=720),
     )
+
+
+def _tables(found: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Section]:
+    """Shares closed and errors of one estimator."""
+    shares = [
+        {"training": kind}
+        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in PLACES.items()}
+        for kind in kinds[1:]
+    ]
+    tables = [report.Section("", shares, ("Share of the gap closed:",))]
+    for words, errors, factor in (
+        ("Errors as shares of the mean force, in percent:", found["errors"], 100.0),
+        ("Errors [mN]:", found["errors_mn"], 1.0),
+    ):
+        rows = [
+            {"trained on": kind, "tested on": flow}
+            | {
+                name: report.mean_cell(tests[f"{place}, {flow}"], factor=factor)
+                for place, name in PLACES.items()
+            }
+            for kind, tests in errors.items()
+            for flow in (FLOWS if kind != NONE else FLOWS[:1])
+        ]
+        tables.append(report.Section("", rows, (words,)))
+    return tables
+
+
+def _sizes(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Shares closed by ridge regression on recovered flow, for each number of fitted sequences."""
+    return [
+        {"fitted": one["fit"]}
+        | {name: _closed(one["places"][place]["closed"]["R"]) for place, name in PLACES.items()}
+        for one in found["ridge"]
+    ]
 
 
 def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
@@ -376,8 +424,8 @@ def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
         at_place = found["places"][place]
         opened, closes = at_place["opened"], at_place["closed"]
         words.append(
-            f"- *{name.capitalize()}*: on recovered flow the network trained on ideal flow errs {opened:.2g} "
-            "times as much as on ideal flow"
+            f"- *{name.capitalize()}*: trained on ideal flow, it errs {opened:.2g} times as much on "
+            "recovered flow as on ideal flow"
         )
         if closes["R"]["undefined"]:
             words[-1] += "; there is no gap to close."
@@ -388,8 +436,8 @@ def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
         if "N" in kinds:
             low, high = (100 * end for end in at_place["noise_less_real"][1:])
             words[-1] += (
-                f", fitted noise {_closed(closes['N'])} (that network errs {low:.2g} to {high:.2g} "
-                "percentage points more than the one trained on recovered flow)"
+                f", fitted noise {_closed(closes['N'])} (its error less that after recovered flow: {low:.2g} "
+                f"to {high:.2g} percentage points)"
             )
         words[-1] += "."
         if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
@@ -411,7 +459,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Sequence[Sequence[float]]]) -> N
                 label=f"trained on {_INPUTS[kind]}, on {flow} flow",
             )
     report.set_log(axes)
-    axes.set(title="Error on held-out sequences over their mean force", xlabel="epochs of training")
+    axes.set(title="D2FNet: error on held-out sequences over their mean force", xlabel="epochs of training")
     axes.axhline(1, color="#9aa3ad", linewidth=1, label="no force")
     report.legend(axes)
 

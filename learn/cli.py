@@ -210,6 +210,11 @@ def predict_command(
     young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     membrane: Annotated[MembraneState, Option(help="Of the pia, for a model with that input.")] = "unknown",
     scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
+    right: Annotated[Path | None, Option(help="A video by a second camera, to the right.")] = None,
+    calibration: Annotated[
+        Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
+    ] = None,
+    mm_per_unit: Annotated[float, Option(min=1e-9, help="Of the calibration's T.")] = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
@@ -230,13 +235,14 @@ def predict_command(
     from learn.inference.apply import apply
     from learn.inference.predict import load_model
     from learn.inference.prediction_file import predict_files, summarise
-    from learn.inference.video_motion import motions, read_options
+    from learn.inference.video_motion import SecondCamera, motions, read_options
     from learn.training.threads import choose_threads
     from synth.flow.recording.decode import RecordingFlowSettings
     from synth.video.pixel_scale import read_scale
 
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
-    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest)
+    second = SecondCamera.of(right, calibration, mm_per_unit)
+    options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest, second=second)
     predicted = []
     predictor = load_model(model, threads=choose_threads(threads))
     each = motions(source, predictor.choose_source(input), options)

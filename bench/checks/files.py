@@ -10,6 +10,7 @@ from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.errors import UserError
 from synth.flow.recording.finding import Finding, judge_scale, judge_young
+from synth.flow.recording.pair_findings import judge_pair
 from synth.video.read_video import VideoFile, find_length, find_start
 
 _FEW = 0.02  # share of the frames lost, from which it is a warning; by hand
@@ -109,6 +110,11 @@ def check_tissue(recording: Recording, tracked: TrackedRecording) -> list[Findin
         return []
     message = f"tissue.png is white on {100 * share:.2g}% of the picture: draw all of the tissue"
     return [Finding("warning", "tissue", message)]
+
+
+def check_pair(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on the right or depth camera."""
+    return [] if tracked.stereo is None else judge_pair(tracked.stereo, tracked.scale_mm_per_px)
 
 
 def check_field_of_view(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

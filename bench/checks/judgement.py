@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.checks import camera_pair, contradiction, files, sensor, times
+from bench.checks import contradiction, files, sensor, times
 from bench.checks.sensor import SensorMotion
 from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
@@ -25,9 +25,7 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     files.check_tissue,
     files.check_tracking,
     files.check_field_of_view,
-    camera_pair.check_pairing,
-    camera_pair.check_quality,
-    camera_pair.check_scale,
+    files.check_pair,
     times.check_times,
     times.check_spans,
     times.check_overlap,

@@ -22,6 +22,11 @@ _IS_IN: Mapping[str, Callable[[Recording], bool]] = {
     ),
     "stiffness": lambda recording: recording.meta.young_kpa is not None,
     "membrane": lambda recording: recording.meta.membrane != "unknown" or recording.meta.tissue == "phantom",
+    "membrane's stiffness": lambda recording: (
+        recording.meta.membrane_mn_per_mm is not None
+        or recording.meta.membrane == "stripped"
+        or recording.meta.tissue == "phantom"
+    ),
     "rest": lambda recording: bool(recording.meta.sensor.free_s or recording.meta.pulse.free_s),
     "taps": lambda recording: _has_common_clock(recording),
     "press": lambda recording: recording.meta.press_s is not None,

@@ -15,7 +15,14 @@ from bench.methods.physics import GRID, Physics
 from bench.tracking.contact_free import ContactFreeSearch
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.inference.apply import gather_notes, to_video_px
-from learn.inference.video_motion import Motion, has_right_camera, motions, read_only, read_options
+from learn.inference.video_motion import (
+    Motion,
+    SecondCamera,
+    has_right_camera,
+    motions,
+    read_only,
+    read_options,
+)
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Ints, Mask
@@ -44,6 +51,9 @@ def estimate(
     rate_hz: float | None = 10.0,
     fps: float = FPS,
     rest_frame: int = 0,
+    right: str | Path | Array | None = None,
+    calibration: str | Path | None = None,
+    mm_per_unit: float = 1.0,
     input: str | None = None,
 ) -> dict[str, Any]:
     """Forces of one video by physics, which needs no training, by the names of `bench estimate`'s NAME.npz.
@@ -63,6 +73,9 @@ def estimate(
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
         rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
+        right: pictures of a second camera, of the same moments and in the same form as a video's.
+        calibration: of the two cameras, by OpenCV (K1, D1, K2, D2, R, T), Kalibr or others.
+        mm_per_unit: of the calibration's T.
         input: displacement read from a sequence: recovered or ideal, with two cameras motion or motion-ideal.
 
     Returns:
@@ -74,7 +87,8 @@ def estimate(
     """
     source = Path(source) if isinstance(source, str) else source
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
-    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame)
+    second = SecondCamera.of(right, calibration, mm_per_unit)
+    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     motion = read_only(source, motions(source, choose_input(source, input), options))
     return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, options.given)
 

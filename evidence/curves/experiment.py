@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from sklearn.decomposition import TruncatedSVD
 
 from evidence import report, result_cache, result_status, training
 from evidence.curves import models
@@ -34,8 +33,6 @@ RIDGE = "ridge"
 NETWORKS = {"d2fnet-s": {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0}}
 SOURCES = {1: "recovered", 2: "motion"}  # displacement for fitting and testing, by number of cameras
 GRID = Grid(64)
-_COMPONENTS = 200  # principal components of displacement
-_BASIS = 150  # sequences that they are found on
 _BATCH, _LEAST, _MOST = 16, 4, 80  # frames a batch, epochs
 SAME = "in distribution"  # tested sequences of the dataset that estimators are fitted on
 Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]  # clips, and whether each lacks a membrane
@@ -65,7 +62,8 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
     """An estimator fitted on `fit`: a network, in about `steps` batches and stored in `work`, with its epoch
     selected by `select`; or ridge."""
     if one.model == RIDGE:
-        return _by_components(one, fit)
+        ridge = models.fit_ridge_on_components(fit, one.source)
+        return lambda clip: ridge(clip, one.source)
     frames = sum(clip.frames for clip in fit)
     arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
     settings = TrainingSettings.model_validate(
@@ -84,26 +82,6 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(fit) + len(select))), ())
     predictor = training.fit(one.slug, [*fit, *select], split, settings, work)
     return partial(models.read_force, predictor, source=one.source)
-
-
-def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
-    """Ridge on principal components of displacement, in eight orientations."""
-    small = [models.coarser(clip) for clip in fit]
-    # Not centred, so that zero motion stays zero.
-    x, _, _ = models.samples(small[:_BASIS], one.source)
-    basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
-    features, forces, groups = [], [], []
-    for start in range(0, len(small), _BASIS):
-        x, force, group = models.samples(small[start : start + _BASIS], one.source)
-        features.append(basis.transform(x))
-        forces.append(force)
-        groups.append(group + start)
-    x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
-    regressor = models.fit_ridge(x, force, group)
-    return lambda clip: (
-        clip.young_kpa
-        * np.asarray(regressor.predict(basis.transform(models.rows(models.coarser(clip), one.source))))
-    )
 
 
 def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""Force estimators: ridge regression on flow, a network.
+"""Force estimators: ridge regression on motion, a network.
 
 Force rotates with the image, so ridge is fitted on every sequence in its eight rotations and reflections,
 which the network draws at random.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.decomposition import TruncatedSVD
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import PredefinedSplit
 
@@ -22,6 +23,8 @@ from learn.network.channels import rotate as rotate_tensors
 from synth.arrays import Array, Floats, Map
 
 _FOLDS = 4
+_COMPONENTS = 200  # principal components of displacement
+_BASIS = 150  # sequences that they are found on
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
 
 
@@ -35,6 +38,32 @@ def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
     how |= {"alphas": _STRENGTHS * np.square(x).sum() / x.shape[1], "cv": PredefinedSplit(group % _FOLDS)}
     across, along = (RidgeCV(**how).fit(x, force[:, part]) for part in (slice(0, 2), 2))
     return SimpleNamespace(predict=lambda rows: np.column_stack([across.predict(rows), along.predict(rows)]))
+
+
+def fit_ridge_on_components(fit: Sequence[Clip], source: str) -> Callable[[Clip, str], Floats]:
+    """Ridge regression on principal components of the displacement `source`, in eight orientations.
+
+    Returns:
+        From a clip and the name of its displacement to its total force (T, 3) mN, camera axes.
+    """
+    small = [coarser(clip) for clip in fit]
+    # Not centred, so that zero motion stays zero.
+    x, _, _ = samples(small[:_BASIS], source)
+    basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
+    features, forces, groups = [], [], []
+    for start in range(0, len(small), _BASIS):
+        x, force, group = samples(small[start : start + _BASIS], source)
+        features.append(basis.transform(x))
+        forces.append(force)
+        groups.append(group + start)
+    x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
+    regressor = fit_ridge(x, force, group)
+
+    def estimate(clip: Clip, displacement: str) -> Floats:
+        found = regressor.predict(basis.transform(rows(coarser(clip), displacement)))
+        return clip.young_kpa * np.asarray(found)
+
+    return estimate
 
 
 def turned(clip: Clip) -> list[Clip]:

@@ -12,7 +12,7 @@ import numpy as np
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.predict import Predictor, force_size, load_model, net_force
-from learn.inference.video_motion import Motion, motions, read_only, read_options
+from learn.inference.video_motion import Motion, SecondCamera, motions, read_only, read_options
 from learn.uncertainty.conformal import LEVELS
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
@@ -40,6 +40,9 @@ def predict(
     rate_hz: float | None = 10.0,
     fps: float = FPS,
     rest_frame: int = 0,
+    right: str | Path | Array | None = None,
+    calibration: str | Path | None = None,
+    mm_per_unit: float = 1.0,
     input: str | None = None,
 ) -> dict[str, Any]:
     """Forces of one video by a network, as `learn predict` estimates them, by the names of its NAME.npz.
@@ -58,6 +61,9 @@ def predict(
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
         rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
+        right: pictures of a second camera, of the same moments and in the same form as a video's.
+        calibration: of the two cameras, by OpenCV (K1, D1, K2, D2, R, T), Kalibr or others.
+        mm_per_unit: of the calibration's T.
         input: displacement read from a sequence, as of `learn predict`.
 
     Raises:
@@ -65,7 +71,8 @@ def predict(
     """
     source = Path(source) if isinstance(source, str) else source
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
-    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame)
+    second = SecondCamera.of(right, calibration, mm_per_unit)
+    options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     predictor = model if isinstance(model, Predictor) else load_model(model)
     motion = read_only(source, motions(source, predictor.choose_source(input), options))
     return apply(predictor, motion, young_kpa, membrane)

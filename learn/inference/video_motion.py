@@ -19,7 +19,10 @@ from synth.flow.estimator import name_motion
 from synth.flow.recording.decode import Footage, RecordingFlowSettings
 from synth.flow.recording.finding import Finding, judge_scale
 from synth.flow.recording.frame_motion import FrameMotion, Size
+from synth.flow.recording.pair_findings import judge_pair
+from synth.flow.recording.stereo_motion import RightVideo
 from synth.flow.recording.video_track import track_video
+from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.stereo_track import Moved
 from synth.system import checked_file
 from synth.video import read_video as video
@@ -45,6 +48,28 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class SecondCamera:
+    """The right camera of a video."""
+
+    pictures: Path | Array  # of the same moments as the left ones, in the same form
+    calibration: Path  # of OpenCV (K1, D1, K2, D2, R, T), Kalibr or others
+    mm_per_unit: float = 1.0  # of T
+
+    @staticmethod
+    def of(
+        right: str | Path | Array | None, calibration: str | Path | None, mm_per_unit: float
+    ) -> SecondCamera | None:
+        """From the arguments of `bench.estimate`; None without both. UserError if only one is given."""
+        if right is None and calibration is None:
+            return None
+        if right is None or calibration is None:
+            lacking = "calibration" if calibration is None else "right"
+            raise UserError(f"{lacking}: a second camera needs its pictures (right) and its calibration")
+        right = Path(right) if isinstance(right, str) else right
+        return SecondCamera(right, Path(calibration), as_positive("mm_per_unit", mm_per_unit))
+
+
+@dataclass(frozen=True)
 class VideoOptions:
     """What a video file lacks, and settings of its flow."""
 
@@ -54,6 +79,7 @@ class VideoOptions:
     tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
     fps: float = video.FPS  # of pictures without times
     rest_frame: int = 0  # number of the frame in which tissue is unloaded; earlier ones are left out
+    second: SecondCamera | None = None
 
     @property
     def given(self) -> tuple[bool, bool]:
@@ -68,6 +94,7 @@ def read_options(
     settings: RecordingFlowSettings,
     fps: float = video.FPS,
     rest_frame: int = 0,
+    second: SecondCamera | None = None,
 ) -> VideoOptions:
     """The options of a video from the arguments of `learn.predict` and `bench.estimate`, and of the commands;
     UserError if one is out of range. The masks' kind replaces that of the settings."""
@@ -76,7 +103,7 @@ def read_options(
         raise UserError(f"rest_frame {rest_frame}: the number of a frame, from 0")
     kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
     tissue = Path(tissue) if isinstance(tissue, str) else tissue
-    return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps, rest_frame)
+    return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps, rest_frame, second)
 
 
 def read_only(source: Path | Array, each: Iterator[Motion]) -> Motion:
@@ -100,6 +127,8 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
         return
     if options is not None and options.rest_frame:
         raise UserError(f"rest_frame {options.rest_frame}: only of a video; {path} starts at rest")
+    if options is not None and options.second is not None:
+        raise UserError(f"right: only of a video; {path} holds motion, with a second camera or without")
     if path.suffix == ".npz":
         yield _arrays(path)
     else:
@@ -173,10 +202,20 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tool = options.tool.of_frames(range(count or 0), taken).read
     elif options.tool is not None:
         tool = partial(_mask, "masks", options.tool)
-    footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool, options.rest_frame)
-    track = track_video(footage, options.settings)
-    rest, findings = track.video.rest, track.video.findings
+    footage = Footage(
+        partial(_pictures, source, options.fps),
+        str(path),
+        tissue,
+        tool,
+        options.rest_frame,
+        depth=_right(options),
+    )
+    track = track_video(footage, options.settings, compare_cameras=footage.depth is not None)
+    rest, findings = track.video.rest, [*track.video.findings]
     scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
+    if track.pair is not None and (quality := track.pair.quality) is not None:
+        taken.append(quality.describe())
+        findings += judge_pair(quality, scale)
     removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
     missing = [finding.message for finding in findings if finding.severity == "missing"]
     return Motion(
@@ -190,6 +229,20 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         notes=(*taken, *track.notes, *removed, *missing),
         findings=(*judge_scale(scale, rest.size[1]), *findings),
         scale_known=scale_known,
+    )
+
+
+def _right(options: VideoOptions) -> RightVideo | None:
+    """The right camera of a video, if there is one. UserError: the video's scale is unknown."""
+    second, scale = options.second, options.scale_mm_per_px
+    if second is None:
+        return None
+    if scale is None or isinstance(scale, str):
+        raise UserError("right: with a second camera the video's scale in mm/px is needed")
+    return RightVideo(
+        partial(_pictures, second.pictures, options.fps),
+        lambda size: read_rig(second.calibration, size[::-1], second.mm_per_unit),
+        scale,
     )
 
 

@@ -84,7 +84,7 @@ def block(
     if fall > 0.8 * size[2]:
         steep = f"the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
         raise UserError(f"anatomy.dome_mm: {steep}")
-    points, cells = _bricks(size, tets / 60)
+    points, cells = bricks(size, tets / 60)
     points, cells = refine(points, cells, _grading(opening_mm, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
     points, cells = with_midsides(points, cells)
@@ -168,7 +168,7 @@ def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], 
     return size
 
 
-def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
+def bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
     """A box cut into about `count` near-cubes of six tetrahedra each, z from -depth to 0."""
     edge = float((size.prod() / max(count, 2)) ** (1 / 3))
     n = np.maximum(np.round(size / edge).astype(int), 1)
@@ -199,7 +199,7 @@ def _fill(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple
 
     lattice = 2 * tets
     for _ in range(4):
-        points, cells = _bricks(size, lattice / 18)
+        points, cells = bricks(size, lattice / 18)
         points += 0.5 * (low + high) + [0, 0, 0.5 * size[2]]
         points, cells = refine(points, cells, grade, lattice)
         points, cells = stuff(points, cells, lambda at: turns(at) - 0.5)

@@ -22,6 +22,7 @@ _SOFT_PX = 4.0  # radius of confusion whose edges are averaged as far as a shado
 _MOST = 4  # times that light is corrected by the lamps that were sampled
 _ENOUGH = 16  # paths per pixel from which on nothing is filtered
 _OUTLINE_PX = 1.0  # smoothing of a share of steel before its slopes are taken
+_MARGIN = 24  # px around the outline
 _SIGMA_PX = 1.5  # of the smoothing before and after slopes are taken
 _FLAT = np.float32(1e-4)  # squared slope per pixel below which there is no edge
 _LEAST = np.float32(1e-6)
@@ -77,7 +78,7 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
 
 
 def _outlined(picture: Map, steel: Map) -> Map:
-    """The picture (H, W, 3) averaged along the outline of a share (H, W) of steel.
+    """The picture (H, W, 3), changed in place: averaged along the outline of a share (H, W) of steel.
 
     A few paths sample the thin shadow beside an outline in some pixels and miss it in the next: it would be a
     row of beads.
@@ -85,8 +86,14 @@ def _outlined(picture: Map, steel: Map) -> Map:
     partial = ((steel > 0) & (steel < 1 - _LEAST)).astype(np.uint8)
     if not partial.any():
         return picture
-    along = _along(cv2.GaussianBlur(steel, (0, 0), _OUTLINE_PX), np.zeros_like(steel))
-    return _averaged(picture, along * cv2.dilate(partial, np.ones((3, 3), np.uint8)))
+    x, y, wide, high = cv2.boundingRect(partial)
+    # As far around as the smoothing and the averages reach.
+    box = np.s_[max(y - _MARGIN, 0) : y + high + _MARGIN, max(x - _MARGIN, 0) : x + wide + _MARGIN]
+    share = np.ascontiguousarray(steel[box])
+    along = _along(cv2.GaussianBlur(share, (0, 0), _OUTLINE_PX), np.zeros_like(share))
+    along *= cv2.dilate(partial[box], np.ones((3, 3), np.uint8))
+    picture[box] = _averaged(np.ascontiguousarray(picture[box]), along)
+    return picture
 
 
 def _scattered(light: Light, shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -> Map:

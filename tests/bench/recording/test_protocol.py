@@ -28,7 +28,8 @@ def test_each_statement_ticks_its_step(tmp_path: Path) -> None:
     given: dict[str, dict[str, Any]] = {
         "scale": {"scale_mm_per_px": 0.1},
         "stiffness": {"young_kpa": 1.0},
-        "membrane": {"membrane": "stripped"},
+        "membrane": {"membrane": "intact"},
+        "membrane's stiffness": {"membrane_mn_per_mm": [20, 60]},
         "press": {"press_s": [0.1, 0.2]},
         "rest": {"pulse": {"free_s": [[0, 0.1]]}},
         "sensor": {"sensor": {"axes": "camera"}},
@@ -38,6 +39,7 @@ def test_each_statement_ticks_its_step(tmp_path: Path) -> None:
     assert lacking() == {*protocol._IS_IN}
     for title, meta in given.items():
         assert lacking(**meta) == {*protocol._IS_IN} - {title}
+    assert lacking(membrane="stripped") == {*protocol._IS_IN} - {"membrane", "membrane's stiffness"}
     assert lacking(sensor_file=False, **given["sensor"], **given["taps"]) == {*protocol._IS_IN}
     one_tap = {"sync": {"method": "correlate", "calibration_s": [0, 0.05], "search_s": 0.01}}
     assert "taps" in lacking(**one_tap), "a request to correlate is no tap"

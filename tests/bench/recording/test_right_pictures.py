@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,13 +11,17 @@ import pytest
 from numpy.typing import NDArray
 from skimage import data
 
-from bench.checks import camera_pair
+import bench
+import synth
 from bench.checks.judgement import judge
 from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
+from bench.methods.physics import Physics
 from bench.recording import recording_writer
 from bench.recording.recording_folder import open_recording
 from bench.tracking.tracking import TrackedRecording, track_recording
+from synth.errors import UserError
 from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.pair_findings import judge_pair_scale
 from synth.flow.recording.right_pictures import PairQuality
 from synth.flow.recording.stereo_timing import find_lag
 from synth.flow.stereo.stereo_track import Moved
@@ -153,10 +158,33 @@ def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: str) -> None:
     assert "error" in severities(replace(PAIR, **{fault: FAULTS[fault]}))
 
 
-def test_a_baseline_in_metres_is_reported(make: Make) -> None:
+@pytest.mark.slow
+def test_estimate_of_two_videos_is_that_of_their_recording(make: Make) -> None:
+    folder, scale = make("right"), AWAY / FOCAL
+    done = track_recording(open_recording(folder), {"physics": Physics()}, scale, SETTINGS)
+    about: dict[str, Any] = {"scale_mm_per_px": scale, "young_kpa": 1.0, "masks": "none", "pulse": False}
+    about |= {"rate_hz": None, "fps": FPS}
+    pair = {"right": folder / "right", "calibration": folder / "pair.yaml", "mm_per_unit": BASE}
+    both = bench.estimate(folder / "frames", **about, **pair)
+    assert both["force_mn"] == pytest.approx(np.array(done.force_mn["physics"]), rel=1e-6)
+    one = bench.estimate(folder / "frames", **about)
+    assert (
+        np.linalg.norm(both["force_mn"] - one["force_mn"], axis=1).max() > 0.1 * both["total_force_mn"].max()
+    )
+    swapped = pair | {"mm_per_unit": 1.0}
+    assert not np.isfinite(bench.estimate(folder / "frames", **about, **swapped)["total_force_mn"]).any()
+    for missing in pair.keys() - {"mm_per_unit"}:
+        with pytest.raises(UserError, match=missing):
+            bench.estimate(folder / "frames", **about, **{k: v for k, v in pair.items() if k != missing})
+    with pytest.raises(UserError, match="scale"):
+        bench.estimate(folder / "frames", **(about | {"scale_mm_per_px": "unknown"}), **pair)
+    with pytest.raises(UserError, match="right"):
+        bench.estimate(next(iter(synth.sample())).path, **pair)
+
+
+def test_a_baseline_in_metres_is_reported() -> None:
     quality = PairQuality(0.024, 0.1, 0.05e-3, 0.01)
-    tracked = TrackedRecording(stereo=quality, scale_mm_per_px=0.05)
-    (found,) = camera_pair.check_scale(open_recording(make("right")), tracked)
+    (found,) = judge_pair_scale(quality, 0.05)
     assert found.severity == "error"
     assert {"metres,", "1000"} <= set(found.message.split())
 

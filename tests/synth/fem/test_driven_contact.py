@@ -1,31 +1,24 @@
 """Instruments that hold and move the tissue: against felupe, closed forms, and the solver of given loads."""
 
-import json
 from dataclasses import replace
-from functools import lru_cache
 from itertools import starmap
-from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from dome import patch
 from driven_gesture import gesture
 
+from evidence.fem.solvers import FELUPE, compare_ball, compare_driven, drive
 from synth.fem import driven_contact, surface_embedding
 from synth.fem.deformation import Deformation
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.fem.material import Pia, Tissue
 from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.refine import refine
-from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, TimeScheme
 from synth.fem.pulse import Pulse
 from synth.fem.solver import deform
 from synth.fem.tool_gesture import Gesture, ToolContact, trajectory
-from synth.geometry.triangles import Shape
 
-FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())
 DOWN, ASIDE, UP = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 TISSUE = Tissue(2.0, 0.45, "ogden", alpha=-8.0)
 RELAXING = ((0.45, 0.5), (0.3, 5.0))
@@ -41,51 +34,17 @@ def run(
     return deform(TimeScheme(relaxation=relaxation), tissue, [driven], tets, patch(), frames, 5.0)
 
 
-@lru_cache
-def flat_block(tets: int, even_mm: float) -> tuple[Tets, Shape]:
-    """The block of `tests/helpers/felupe_ogden.py`, finest within `even_mm` of its middle; a fine surface."""
-    size = np.array([40.0, 40.0, 20.0])
-    points, cells = tetrahedra._bricks(size, 40)
-    points, cells = refine(points, cells, lambda at: np.maximum(even_mm, np.linalg.norm(at, axis=1)), tets)
-    points, cells = tetrahedra.with_midsides(points, cells)
-    fixed = (np.abs(np.abs(points[:, :2]) - 20) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - 20)
-    vertices, faces = patch(121, 24.0)
-    vertices[:, 2] = 0
-    return Tets(points, cells, fixed, sp.csr_array((len(points),) * 2)), Shape(vertices, faces)
-
-
 def marked(number: int, scene: dict) -> object:  # type: ignore[type-arg]
     """A scene: slow where its contact is so wide that it needs a finer mesh, and half of those a trial."""
     marks = [] if scene["radius"] < 6 else [pytest.mark.slow if number % 2 else pytest.mark.trial]
     return pytest.param(scene, marks=marks, id=f"{scene['radius']:g} {scene['alpha']:g} {scene['way']}")
 
 
-def driven(
-    radius: float, way: np.ndarray, poisson: float, alpha: float, places: np.ndarray, tets: int = 2400
-) -> tuple[np.ndarray, np.ndarray]:
-    """Reaction (3,) mN and motion (P, 3) mm at places on felupe's block, of a disc that is driven."""
-    mesh, surface = flat_block(tets, 0.5 * radius)
-    length = float(np.linalg.norm(way))
-    disc = gesture(direction=tuple((way / length).tolist()), travel=length, size=(2 * radius,) * 2)
-    tissue = Tissue(1.0, poisson, "ogden", alpha=alpha)
-    area = surface_embedding.vertex_area(*surface)
-    embedding = surface_embedding.embed(mesh, surface.vertices)
-    held = driven_contact.layers([disc], tissue, embedding, surface.vertices, area)
-    base, motion = tissue.equations(mesh), trajectory(disc, 3)
-    path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *mesh.points.shape)))
-    assert path.way[1, 0] == pytest.approx(length)
-    u = path.displacement[1]
-    return held[0].reaction(u, path.way[1, 0]), surface_embedding.embed(mesh, places).move(u)
-
-
 @pytest.mark.parametrize("scene", list(starmap(marked, enumerate(FELUPE["scenes"]))))
 def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[type-arg]
-    radius, places = scene["radius"], np.array(scene["places"])
-    tets = 2400 if radius < 6 else 3200
-    force, moved = driven(radius, np.array(scene["way"]), scene["poisson"], scene["alpha"], places, tets)
-    wanted, apart = np.array(scene["reaction"]), np.abs(moved - scene["displacement"])
-    assert np.linalg.norm(force - wanted) <= 0.02 * np.linalg.norm(wanted)
-    assert apart.max() <= 0.03 * np.linalg.norm(scene["displacement"], axis=1).max()
+    found = compare_driven(scene, 2400 if scene["radius"] < 6 else 3200)
+    assert found["force_error"] <= 0.02
+    assert found["motion_error"] <= 0.03
 
 
 BALLS = [
@@ -98,20 +57,16 @@ BALLS = [
 
 @pytest.mark.parametrize("scene", BALLS)
 def test_a_disc_that_sticks_moves_tissue_as_a_ball_does_that_only_presses(scene: dict) -> None:  # type: ignore[type-arg]
-    x, depth = np.array(scene["places"]), scene["depth"]
-    way, places = np.array([0.0, 0.0, -depth]), np.column_stack([x, 0 * x, 0 * x])
-    force, moved = driven(scene["touched"], way, scene["poisson"], scene["alpha"], places)
-    factor = force[2] / scene["reaction"][2]
-    assert 0.9 < factor < 1.13
-    apart = np.linalg.norm(moved / factor - scene["displacement"], axis=1)
-    assert apart[x > 1.2 * scene["touched"]].max() < 0.07 * depth
+    found = compare_ball(scene)
+    assert 0.9 < found["force"] < 1.13
+    assert found["motion_error"] < 0.07
 
 
 def test_a_small_press_is_that_of_a_ball() -> None:
     """F = 4/3 E* sqrt(R d^3) where a = sqrt(R d) touches (Johnson 1985, 4.2); a disc is as stiff at 0.9 a."""
     ball, depth = 6.0, 0.1
     way, middle = np.array([0.0, 0.0, -depth]), np.zeros((1, 3))
-    force, _ = driven(0.9 * np.sqrt(ball * depth), way, 0.45, -8.0, middle)
+    force, _ = drive(0.9 * np.sqrt(ball * depth), way, 0.45, -8.0, middle)
     hertz = 4 / 3 / (1 - 0.45**2) * np.sqrt(ball * depth**3)
     assert -force[2] == pytest.approx(hertz, rel=0.07)
 

@@ -88,7 +88,7 @@ def test_force_is_the_slope_of_energy_and_stiffness_that_of_force_at_rest(poisso
 
 
 def test_bisection_conforms_and_keeps_volume_and_orientation() -> None:
-    points, cells = tetrahedra._bricks(np.array([100.0, 100.0, 60.0]), 16)
+    points, cells = tetrahedra.bricks(np.array([100.0, 100.0, 60.0]), 16)
     for seed in range(4):
         chosen = np.random.default_rng(seed).choice(len(cells), 5, replace=False)
         points, cells = bisect(points, cells, chosen)

@@ -1,18 +1,14 @@
-"""Ogden's law against felupe and finite differences; see `tests/helpers/felupe_ogden.py`."""
-
-import json
-from pathlib import Path
+"""Ogden's law against felupe and finite differences; see `evidence/fem/felupe_ogden.py`."""
 
 import numpy as np
 import pytest
 from shaken_cube import cube
 
+from evidence.fem.solvers import FELUPE
 from synth.fem import ogden
 from synth.fem.laws import lame
 from synth.fem.system import assemble, hooke
 from synth.fem.tangent import linearise
-
-FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())
 
 
 def stress(f: np.ndarray, poisson: float, alpha: float) -> tuple[np.ndarray, np.ndarray]:

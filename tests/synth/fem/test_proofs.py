@@ -33,7 +33,7 @@ def box(points: Floats, cells: Floats, size: tuple[float, float, float]) -> Tets
 
 
 def cubes(size: tuple[float, float, float], count: float) -> Tets:
-    return box(*tetrahedra._bricks(np.array(size), count), size)
+    return box(*tetrahedra.bricks(np.array(size), count), size)
 
 
 def boussinesq(at: Floats, young: float, poisson: float) -> Floats:
@@ -50,7 +50,7 @@ def boussinesq(at: Floats, young: float, poisson: float) -> Floats:
 def test_kernel_on_a_half_space(poisson: float) -> None:
     """w0 = 1.0186 (1 - nu^2) F / (a E) under (1 - (r/a)^2)^2; the far boundary carries the solution."""
     a, size = 1.0, (4.0, 4.0, 2.0)
-    points, cells = tetrahedra._bricks(np.array(size), 20)
+    points, cells = tetrahedra.bricks(np.array(size), 20)
     points, cells = refine(points, cells, lambda at: 0.25 + np.linalg.norm(at, axis=1), 2000)
     tets = box(points, cells, size)
     # The kernel as 24 rings of 24 point forces each.

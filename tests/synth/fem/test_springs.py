@@ -96,7 +96,7 @@ def test_damped_motion_comes_to_rest_in_equilibrium() -> None:
 
 def cube() -> Tets:
     """A cube of 10 mm on a fixed floor."""
-    points, cells = tetrahedra.with_midsides(*tetrahedra._bricks(np.array([10.0, 10.0, 10.0]), 8))
+    points, cells = tetrahedra.with_midsides(*tetrahedra.bricks(np.array([10.0, 10.0, 10.0]), 8))
     return Tets(points, cells, points[:, 2] < -10 + 1e-9, sp.csr_array((len(points),) * 2))
 
 

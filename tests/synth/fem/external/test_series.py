@@ -5,10 +5,12 @@ import json
 import os
 import re
 import resource
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -62,6 +64,36 @@ def ordered(series: MeshSeries) -> list[Floats]:
     assert series.force is not None
     order = np.lexsort(series.points.round(3).T)
     return [series.points[order], series.displacement[2][order], series.force[2][order]]
+
+
+def test_sofas_recorder_on_the_page_writes_a_series(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's controller with stand-ins for SOFA's objects, which hold the block's states one by one."""
+    page = Path(__file__).parents[4] / "docs" / "howto" / "mechanics.md"
+    (code,) = re.findall(r'title="record_sofa.py"\n(.*?)```', page.read_text("utf-8"), re.S)
+    sofa, core = ModuleType("Sofa"), ModuleType("Sofa.Core")
+    core.Controller = type("Controller", (), {"__init__": lambda self, **words: None})  # type: ignore[attr-defined]
+    sofa.Core = core  # type: ignore[attr-defined]
+    for module in (sofa, core):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    space, (mm, mn) = dict[str, Any](), (1000.0, 1000.0)
+    exec(code, space)
+    block = solve()
+    held = {"lambda": SimpleNamespace(value=np.zeros((0, 3)))}
+    tissue = SimpleNamespace(position=SimpleNamespace(value=block.points / mm), getData=held.__getitem__)
+    root = SimpleNamespace(time=SimpleNamespace(value=0.0))
+    solver = SimpleNamespace(constraintForces=SimpleNamespace(value=[]))
+    recorder = space["Recorder"](root, solver, tissue, block.tets)
+    for k, part in enumerate(block.scale[1:], 1):
+        root.time.value, touched = STEP_S * k, part > 0
+        tissue.position.value = (block.points + part * block.u) / mm
+        solver.constraintForces.value = [1.0] if touched else []
+        held["lambda"].value = part * block.force / mn if touched else np.zeros((0, 3))
+        recorder.onAnimateEndEvent(None)
+    recorder.save(tmp_path / "press.npz")
+    found, true = read(tmp_path / "press.npz", mm, mn), read(write(tmp_path / "s", "points", mm, mn), mm, mn)
+    assert found.time == pytest.approx(true.time)
+    for one, other in zip(ordered(found), ordered(true), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -1,12 +1,11 @@
-"""Checks of the right or depth camera: its pictures, timing, calibration, noise and scale."""
+"""Findings on the right or depth camera: its pictures, timing, calibration, noise and scale."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bench.recording.recording_folder import Recording
-from bench.tracking.tracking import TrackedRecording
 from synth.flow.recording.finding import Finding
+from synth.flow.recording.right_pictures import PairQuality
 
 # Chosen by hand between the corrupted and the clean recordings of docs/results/scoring/stability.
 _FROZEN = 3  # frames
@@ -20,11 +19,13 @@ _OTHER_SCALE, _ANOTHER_SCALE = 0.1, 0.3
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "micrometres": 0.001}
 
 
-def check_pairing(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+def judge_pair(stereo: PairQuality, stated_mm_per_px: float | None) -> list[Finding]:
+    """All findings on a pair; `stated_mm_per_px`: of the video's own pixels, None if not stated."""
+    return [*judge_pairing(stereo), *judge_quality(stereo), *judge_pair_scale(stereo, stated_mm_per_px)]
+
+
+def judge_pairing(stereo: PairQuality) -> list[Finding]:
     """Findings on right pictures that are copies, frozen, swapped with the left ones, late or early."""
-    stereo = tracked.stereo
-    if stereo is None:
-        return []
     if stereo.copied:
         fault = "shows the left camera's own pictures"
     elif stereo.frozen >= _FROZEN:
@@ -41,11 +42,8 @@ def check_pairing(recording: Recording, tracked: TrackedRecording) -> list[Findi
     return [Finding("error", "stereo", f"the right camera {fault}")]
 
 
-def check_quality(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+def judge_quality(stereo: PairQuality) -> list[Finding]:
     """Findings on the right camera's calibration, motion and focus, and on the noise of depth motion."""
-    stereo = tracked.stereo
-    if stereo is None:
-        return []
     if stereo.epipolar_px > _OTHER_ROWS_PX:
         rows = f"rows of left and right picture are {stereo.epipolar_px:.2g} px off"
         return [Finding("error", "stereo", f"{rows}: is the calibration of this camera pair?")]
@@ -62,10 +60,9 @@ def check_quality(recording: Recording, tracked: TrackedRecording) -> list[Findi
     return found
 
 
-def check_scale(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
-    """Findings on a stated scale that differs from that of the right or depth camera."""
-    stereo, stated = tracked.stereo, tracked.scale_mm_per_px
-    if stereo is None or not stated or (off := abs(np.log(stereo.mm_per_px / stated))) <= _OTHER_SCALE:
+def judge_pair_scale(stereo: PairQuality, stated: float | None) -> list[Finding]:
+    """Findings on a stated scale [mm/px] that differs from that of the right or depth camera."""
+    if not stated or (off := abs(np.log(stereo.mm_per_px / stated))) <= _OTHER_SCALE:
         return []
     message = f"{stated:.4g} mm/px is stated, but stereo gives {stereo.mm_per_px:.4g}"
     for unit, times in _UNITS_MM.items():

@@ -2,7 +2,7 @@
 
 Run it with a Python that has felupe (GPL: it judges and never ships) and pypardiso:
 
-    python tests/helpers/felupe_ogden.py
+    python evidence/fem/felupe_ogden.py
 
 `points`: stress and tangent of the law at deformation gradients. `scenes`: a block of 40 x 40 x 20 mm, E 1
 kPa, fixed but for its top, on which a layer of springs k0 (1 - (r/a)^2)^2 joins a disc to an instrument that
