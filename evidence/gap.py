@@ -56,7 +56,7 @@ NONE = "no force"  # the trivial baseline
 _KEY = "force_mae"  # error of a sequence: of the total force [mN]
 _RESAMPLES = 2000
 _INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered", "S": "recovered"}
-_SHOWN = (2, 4, 8, 16, 32, 64, 96, 128, 192, 256)  # epochs of the curve
+_SHOWN = (2, 4, 8, 16, 32, 48, 64, 96, 128, 192, 256)  # epochs of the curve
 
 
 def measure(
@@ -66,7 +66,7 @@ def measure(
     recordings: Path,
     work: Path = Path("runs/gap"),
     fit: int = 375,
-    epochs: int = 96,
+    epochs: int = 64,
     seeds: int = 1,
     kinds: str = ",".join(KINDS),
     device: str = "cpu",
