@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,18 +104,13 @@ def measure(
     if not {"I", "R"} <= {*chosen} <= {*KINDS}:
         raise UserError(f"kinds {kinds!r}: I and R, and any of {', '.join(KINDS[2:])}")
     force = {place: [_mean_force(clip) for clip in part] for place, part in tested.items()}
-    ridge = []
-    for size in (len(split.fit) // 4, len(split.fit) // 2, len(split.fit)):
-        by_kind = {kind: [ridge_errors(kind, clips, split.fit[:size], tests)] for kind in KINDS}
-        ridge.append({"fit": size} | summary(by_kind, force))
     trained: dict[str, list[Errors]] = {kind: [] for kind in chosen}
     curve: dict[str, list[list[float]]] = {}
-    for seed in range(seeds):
-        for kind in chosen:
-            seeded = changed(settings, seed=seed, input=_INPUTS[kind])
-            made = errors(kind, clips, split, seeded, tests, work, device)
-            trained[kind].append(made["errors"])
-            curve.setdefault(kind, made["curve"])
+    for seed, kind in product(range(seeds), chosen):
+        seeded = changed(settings, seed=seed, input=_INPUTS[kind])
+        made = errors(kind, clips, split, seeded, tests, work, device)
+        trained[kind].append(made["errors"])
+        curve.setdefault(kind, made["curve"])
     noise = fit_noise([clips[i] for i in split.fit])
     sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
@@ -124,7 +120,7 @@ def measure(
         "seeds": seeds,
         "noise": asdict(noise),
         "curve": {kind: curve[kind] for kind in ("I", "R")},
-        "ridge": ridge,
+        "ridge": ridge_by_size(clips, split.fit, tests, force),
     } | summary(trained, force)
 
 
@@ -172,6 +168,17 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     if set(number[: len(clips)]) & set(number[len(clips) :]):
         raise UserError("unseen: shares an anatomy with the other dataset")
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
+
+
+def ridge_by_size(
+    clips: Sequence[Clip], fit: Sequence[int], tests: Tests, force: Mapping[str, Sequence[float]]
+) -> list[dict[str, Any]]:
+    """`summary` of ridge regression on a quarter, a half and all of the clips at `fit`, with their number."""
+    rows = []
+    for size in (len(fit) // 4, len(fit) // 2, len(fit)):
+        by_kind = {kind: [ridge_errors(kind, clips, fit[:size], tests)] for kind in KINDS}
+        rows.append({"fit": size} | summary(by_kind, force))
+    return rows
 
 
 def known_to(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) -> list[Clip]:

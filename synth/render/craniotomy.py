@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synth.arrays import Map, Mask
+from synth.arrays import Floats, Map, Mask
 from synth.render import instrument, scenery
 from synth.render.anatomy import noise, rim, texture
 from synth.render.anatomy.rim import Rim
@@ -37,7 +37,7 @@ _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wide
 _COATS = Recent[Coat](2, lambda coat: coat.albedo.nbytes + coat.normal.nbytes + coat.dry.nbytes)
 
 
-def craniotomy(
+def build_craniotomy(
     surface: CortexSurface,
     appearance: Appearance,
     camera: Camera,
@@ -64,50 +64,22 @@ def craniotomy(
     patch, px_mm = resize(surface, 1 / how.scale), camera.mm_per_px / how.scale
     seen_mm = _SEEN * 0.5 * float(np.hypot(*camera.size)) * px_mm
     around = rim.build(patch, opening_mm / how.scale, appearance, px_mm, seen_mm)
-    pixels, texels = (
-        min(texture.resolution(extent, one), _MOST_TEXELS if how.scale != 1 else 4096)
-        for extent, one in ((patch.chart.extent_mm, px_mm), (around.extent_mm, 2.2 * px_mm))
-    )
     lamps = light.lamps(camera, appearance.light)
-    if how.pattern is None:
-        x, y, rise = light.mirror_slopes(camera, lamps[0])
-        mirror = x, y, rise * how.scale
-        shade = rim.shade(around, patch) if how.surroundings is None else None
-        paint = partial(texture.cortex, patch, appearance, pixels, photo, shade, mirror)
-        coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade, mirror)
-        wet = appearance.roughness, appearance.dry_roughness
-        if how.tinted:
-            coat = replace(coat, albedo=pattern.tinted(coat.albedo, how.tint, how.tinted))
-    else:
-        coat = pattern.paint(how.pattern, pixels, patch.chart.extent_mm)
-        wet = how.pattern.roughness, appearance.dry_roughness
-    cortex = Wet(coat, *wet, ambient, appearance.fluid_index)
-    # Where only the truth at rest is needed, the rim stays unpainted, which saves a second.
-    seen = _seen(camera, around.extent_mm, how.scale)
-    paint_rim = partial(rim.paint, around, appearance, texels, seen)
-    painted = partial(_COATS.get, paint_rim, around, appearance, texels, seen)
-    rim_coat = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
-    # Only faces that may be seen: all bodies' trees are made anew every frame.
-    column, row = np.clip((around.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
-    shown = seen[row, column][around.shape.faces].any(axis=1)
-    shown[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
-    faces = around.shape.faces[shown]
-    static = [Body(how.scale * around.shape.vertices, faces, around.uv, rim_coat)]
+    slopes = light.mirror_slopes(camera, lamps[0])
+    coat = _paint_cortex(patch, around, appearance, px_mm, slopes, how, photo)
+    roughness = appearance.roughness if how.pattern is None else how.pattern.roughness
+    cortex = Wet(coat, roughness, appearance.dry_roughness, ambient, appearance.fluid_index)
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
-    if how.surroundings is not None:
+    if how.surroundings is None:
+        first = _paint_rim(around, appearance, camera, px_mm, ambient, how.scale)
+        static = [first, *_place_scenery(around, appearance, camera, theatre, surface, first, how.scale)]
+    else:
         sizes = opening_mm, 2 * camera.mm_per_px * camera.size[0]
         sheet = surroundings.sheet(how.surroundings, surface.vertices, *sizes, ambient)
         static = [] if how.surroundings.kind == "nothing" else [sheet]
-    ground = np.concatenate([surface.vertices, *(one.vertices for one in static)])
-    seed, px = appearance.rim_seed, camera.mm_per_px
-    if how.surroundings is None:
-        if "retractor" in appearance.scenery:
-            static.append(scenery.build_retractor(how.scale * around.edge, theatre, ground, seed, px))
-        for name, objects in scenery.ALONG_RIM.items():
-            if name in appearance.scenery:
-                static += objects(around, how.scale, theatre, ground, seed, camera)
-    hand = np.random.default_rng([seed, 2])
+    hand = np.random.default_rng([appearance.rim_seed, 2])
+    ground = _gather_ground(surface, static[:1])
     # In the corners of the patch, farther under the rim than at its sides.
     corners = np.hypot(*surface.vertices[:, :2].T) > 0.5 * surface.extent_mm
     return SceneContent(
@@ -118,6 +90,75 @@ def craniotomy(
         instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),
         spot=appearance.light.even,
     )
+
+
+def _paint_cortex(
+    patch: CortexSurface,
+    around: Rim,
+    appearance: Appearance,
+    px_mm: float,
+    slopes: tuple[float, float, float],
+    how: Randomization,
+    photo: Path | None,
+) -> Coat:
+    """The maps of the tissue; `px_mm`: of a pixel on it, in the usual size; `slopes`: `mirror_slopes`."""
+    pixels = _count_texels(patch.chart.extent_mm, px_mm, how.scale)
+    if how.pattern is not None:
+        return pattern.paint(how.pattern, pixels, patch.chart.extent_mm)
+    x, y, rise = slopes
+    mirror = x, y, rise * how.scale
+    shade = rim.shade(around, patch) if how.surroundings is None else None
+    paint = partial(texture.cortex, patch, appearance, pixels, photo, shade, mirror)
+    coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade, mirror)
+    if how.tinted:
+        coat = replace(coat, albedo=pattern.tinted(coat.albedo, how.tint, how.tinted))
+    return coat
+
+
+def _paint_rim(
+    around: Rim, appearance: Appearance, camera: Camera, px_mm: float, ambient: Floats, scale: float
+) -> Body:
+    """The rim, painted once it is drawn: where only the truth at rest is needed, that saves a second."""
+    texels = _count_texels(around.extent_mm, 2.2 * px_mm, scale)
+    seen = _seen(camera, around.extent_mm, scale)
+    paint = partial(rim.paint, around, appearance, texels, seen)
+    painted = partial(_COATS.get, paint, around, appearance, texels, seen)
+    # Only faces that may be seen: all bodies' trees are made anew every frame.
+    column, row = np.clip((around.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
+    shown = seen[row, column][around.shape.faces].any(axis=1)
+    shown[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
+    finish = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
+    return Body(scale * around.shape.vertices, around.shape.faces[shown], around.uv, finish)
+
+
+def _place_scenery(
+    around: Rim,
+    appearance: Appearance,
+    camera: Camera,
+    theatre: Theatre,
+    surface: CortexSurface,
+    painted: Body,
+    scale: float,
+) -> list[Body]:
+    """What lies on the rim, the body `painted`: retractor, clips, drapes."""
+    ground, seed = _gather_ground(surface, [painted]), appearance.rim_seed
+    placed: list[Body] = []
+    if "retractor" in appearance.scenery:
+        placed.append(scenery.build_retractor(scale * around.edge, theatre, ground, seed, camera.mm_per_px))
+    for name, objects in scenery.ALONG_RIM.items():
+        if name in appearance.scenery:
+            placed += objects(around, scale, theatre, ground, seed, camera)
+    return placed
+
+
+def _gather_ground(surface: CortexSurface, bodies: Sequence[Body]) -> Floats:
+    """Points (V, 3) mm of the tissue and what surrounds it, on which things lie."""
+    return np.concatenate([surface.vertices, *(one.vertices for one in bodies)])
+
+
+def _count_texels(extent_mm: float, px_mm: float, scale: float) -> int:
+    """Width of a map of that extent for pixels of `px_mm`."""
+    return min(texture.resolution(extent_mm, px_mm), _MOST_TEXELS if scale != 1 else 4096)
 
 
 def _seen(camera: Camera, extent_mm: float, scale: float) -> Mask:

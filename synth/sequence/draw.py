@@ -22,6 +22,7 @@ from synth.render.camera import camera as cameras
 from synth.render.camera import camera_calibration
 from synth.render.camera.camera import Camera, Lens, visible_radius
 from synth.render.idle import draw_idle
+from synth.render.randomized.surroundings import Randomization
 from synth.sequence import randomization, scenario
 from synth.sequence.job_instruments import read_job_instruments
 from synth.sequence.scenario import Scenario
@@ -102,35 +103,7 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
         return np.random.default_rng(seed(*key))
 
     if case is None:
-        family = job.appearance.families[index % len(job.appearance.families)]
-        fem = job.fem.of_contact(scenario.choose(generator(_CONTACT), job.fem.contact))
-        relief = np.random.default_rng(SeedSequence(job.seed, spawn_key=(_ANATOMY, index, 0)))
-        case = Scenario(
-            index=index,
-            family=family,
-            relief=scenario.draw_relief(job.anatomy, relief),
-            tissue=scenario.draw_tissue(fem, generator(_TISSUE)),
-            gestures=(),
-            view=scenario.draw_view(job.render, generator(_VIEW)),
-            camera_motion=scenario.draw_camera_motion(job.render, generator(_CAMERA_MOTION)),
-            pulse=scenario.draw_pulse(job.fem.pulse, generator(_PULSE)),
-            appearance=scenario.draw_appearance(job, family, generator(_APPEARANCE)),
-            randomized=randomized,
-            attempt=attempt,
-        )
-        view, appearance = randomization.vary(case.view, case.appearance, job, index, lens, off_centre)
-        camera = cameras.place(view, lens)
-        visible_mm, opening_mm = visible_radius(camera), job.anatomy.craniotomy.radius_mm
-        again = (_REDRAW, attempt) if attempt else ()
-        rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-        shown = visible_mm, camera.centre
-        young_kpa = case.tissue.young_kpa
-        gestures = scenario.draw_gestures(fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
-        lines = [[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]
-        acting = np.array(lines).reshape(-1, 2, 3)
-        strength = job.randomize.get("instruments", 0.0)
-        idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting)
-        case = replace(case, view=view, appearance=appearance, gestures=gestures, idle=idle)
+        case, camera = _draw_case(job, (index, attempt), lens, (randomized, off_centre), generator)
     else:
         camera = cameras.place(case.view, lens)
     if lens.K is not None:
@@ -151,6 +124,51 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
         frame_seeds=tuple(seed(_NOISE).generate_state(job.frames).tolist()),
         label_seed=seed(_LABELS),
     )
+
+
+def _draw_case(
+    job: Job,
+    number: tuple[int, int],
+    lens: Lens,
+    varied: tuple[Randomization | None, tuple[float, float]],
+    generator: Callable[..., np.random.Generator],
+) -> tuple[Scenario, Camera]:
+    """A sequence's scenario, and its camera.
+
+    `number`: index and attempt; `varied`: of `randomization.randomize`; `generator`: of the numbers of a
+    sequence's part.
+    """
+    index, attempt = number
+    randomized, off_centre = varied
+    family = job.appearance.families[index % len(job.appearance.families)]
+    fem = job.fem.of_contact(scenario.choose(generator(_CONTACT), job.fem.contact))
+    relief = np.random.default_rng(SeedSequence(job.seed, spawn_key=(_ANATOMY, index, 0)))
+    case = Scenario(
+        index=index,
+        family=family,
+        relief=scenario.draw_relief(job.anatomy, relief),
+        tissue=scenario.draw_tissue(fem, generator(_TISSUE)),
+        gestures=(),
+        view=scenario.draw_view(job.render, generator(_VIEW)),
+        camera_motion=scenario.draw_camera_motion(job.render, generator(_CAMERA_MOTION)),
+        pulse=scenario.draw_pulse(job.fem.pulse, generator(_PULSE)),
+        appearance=scenario.draw_appearance(job, family, generator(_APPEARANCE)),
+        randomized=randomized,
+        attempt=attempt,
+    )
+    view, appearance = randomization.vary(case.view, case.appearance, job, index, lens, off_centre)
+    camera = cameras.place(view, lens)
+    visible_mm, opening_mm = visible_radius(camera), job.anatomy.craniotomy.radius_mm
+    again = (_REDRAW, attempt) if attempt else ()
+    rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
+    shown = visible_mm, camera.centre
+    young_kpa = case.tissue.young_kpa
+    gestures = scenario.draw_gestures(fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
+    lines = [[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]
+    acting = np.array(lines).reshape(-1, 2, 3)
+    strength = job.randomize.get("instruments", 0.0)
+    idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting)
+    return replace(case, view=view, appearance=appearance, gestures=gestures, idle=idle), camera
 
 
 @checked

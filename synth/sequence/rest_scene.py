@@ -26,7 +26,7 @@ from synth.render.anatomy.surface import CortexSurface, Relief, grow, resize
 from synth.render.camera.camera import Camera
 from synth.render.camera.video_link import transmit
 from synth.render.content import SceneContent
-from synth.render.craniotomy import craniotomy
+from synth.render.craniotomy import build_craniotomy
 from synth.render.scene import RenderedFrame, Renderer, SceneState
 from synth.sequence.draw import Draw, draw
 from synth.sequence.job_instruments import read_job_instruments
@@ -241,7 +241,7 @@ def draw_craniotomy(rest: RestScene) -> SceneContent:
     """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
     case, job = rest.scenario, rest.job
     acting = [(kind, radius_mm) for gesture, kind, radius_mm in rest.instruments if gesture != "idle"]
-    return craniotomy(
+    return build_craniotomy(
         rest.surface,
         case.appearance,
         rest.view,

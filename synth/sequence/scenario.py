@@ -17,7 +17,14 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, Contact, InstrumentSection, name_of
+from synth.job.mechanics_sections import (
+    CLEAR_MM,
+    DRIVEN_SIZES_MM,
+    Contact,
+    Instrument,
+    InstrumentSection,
+    name_of,
+)
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render import instrument
@@ -260,14 +267,7 @@ def draw_driven_gesture(
     tools = choices[kind]
     chosen = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
     tool, sized = name_of(chosen), chosen if isinstance(chosen, str) else "none"
-    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[sized])
-    if sized in _ROUND:
-        width = length
-    elif kind in ("push", "tap"):
-        length = min(length, _TIP_LENGTH * width)  # it presses with its end
-    if given.footprint_mm is not None:
-        scale = 2 * _uniform(rng, given.footprint_mm) / np.sqrt(length * width)
-        length, width = scale * length, scale * width
+    length, width = _draw_size(kind, sized, rng, given)
     mean = float(np.sqrt(length * width))  # of the fold that a grasp holds
     spread, closing, reach = 0.1 * width, 0.0, 0.5 * float(np.hypot(length, width))
     if kind == "grasp":  # each tip holds a half of it
@@ -282,18 +282,7 @@ def draw_driven_gesture(
     azimuth = _uniform(rng, (0, 360))
     if kind == "retract":  # the hand is on the side that tissue is drawn to
         azimuth = float((np.degrees(np.arctan2(along[1], along[0])) + _uniform(rng, (-30, 30))) % 360)
-    way, force = rng.uniform(), None
-    ranges = given if given.travel_mm or given.force_mn else fem
-    if ranges.force_mn is not None:
-        force = float(ranges.force_mn[0] * (ranges.force_mn[1] / ranges.force_mn[0]) ** way)
-    low, high = ranges.travel_mm or (0.0, 0.0)
-    holds = _HOLDS[kind] * mean
-    if given.travel_mm is None:  # one that is named is as given
-        low, high = min(low, holds), min(high, holds)
-    travel = None
-    if force is None:
-        log = fem.travel_scale == "log"
-        travel = float(low * (high / low) ** way if log else low + way * (high - low))
+    travel, force = _draw_way(fem, _HOLDS[kind] * mean, rng, given)
     places, _ = tool_gesture.grip(kind, point, direction, spread, azimuth)
     touch, full, fall, release = map(float, given.timing or _draw_timing(kind, rng, frames))
     return Gesture(
@@ -314,6 +303,35 @@ def draw_driven_gesture(
         timing=(touch, full, fall, release),
         drive=Drive(travel, force, closing, (length, width), yields=given.travel_mm is None),
     )
+
+
+def _draw_size(kind: str, sized: Instrument, rng: Random, given: InstrumentSection) -> tuple[float, float]:
+    """Length and width [mm] of what an instrument holds; `sized`: its name among `DRIVEN_SIZES_MM`."""
+    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[sized])
+    if sized in _ROUND:
+        width = length
+    elif kind in ("push", "tap"):
+        length = min(length, _TIP_LENGTH * width)  # it presses with its end
+    if given.footprint_mm is not None:
+        scale = 2 * _uniform(rng, given.footprint_mm) / np.sqrt(length * width)
+        length, width = scale * length, scale * width
+    return length, width
+
+
+def _draw_way(
+    fem: FemSection, holds_mm: float, rng: Random, given: InstrumentSection
+) -> tuple[float | None, float | None]:
+    """Travel [mm], at most `holds_mm` unless it is given, or instead of it the force [mN] to be reached."""
+    way = rng.uniform()
+    ranges = given if given.travel_mm or given.force_mn else fem
+    if ranges.force_mn is not None:
+        low, high = ranges.force_mn
+        return None, float(low * (high / low) ** way)
+    low, high = ranges.travel_mm or (0.0, 0.0)
+    if given.travel_mm is None:  # one that is named is as given
+        low, high = min(low, holds_mm), min(high, holds_mm)
+    log = fem.travel_scale == "log"
+    return float(low * (high / low) ** way if log else low + way * (high - low)), None
 
 
 def _are_apart(gesture: Gesture, other: Gesture, meshes: Mapping[str, OwnMesh]) -> bool:

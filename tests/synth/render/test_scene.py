@@ -16,7 +16,7 @@ from synth.render import idle
 from synth.render.anatomy import rim
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
-from synth.render.craniotomy import craniotomy
+from synth.render.craniotomy import build_craniotomy
 from synth.render.mitsuba.adapter import pick
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
@@ -41,7 +41,7 @@ def made(
     appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
     appearance = replace(appearance, scenery=job.render.scenery)
     lens = camera.place(view, read_lens(job.render))
-    content = craniotomy(surface, appearance, lens, 12.0, [("forceps" if tool else "none", 4.0)])
+    content = build_craniotomy(surface, appearance, lens, 12.0, [("forceps" if tool else "none", 4.0)])
     right = place_right(job.render, lens)
     ours = Renderer(content, lens, appearance.sensor, extra, right, spp=spp, variant=variant)
     return ours, surface.vertices
