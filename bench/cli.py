@@ -125,6 +125,9 @@ def estimate(
     out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
     scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
     young: Young = None,
+    young_uncertainty: Annotated[
+        float, Option(min=0.0, help="Its relative standard deviation: widens the interval.")
+    ] = 0.0,
     membrane: Annotated[MembraneState, Option(help="Of the pia.")] = "unknown",
     membrane_mn_per_mm: Annotated[
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
@@ -141,7 +144,9 @@ def estimate(
     flow: Backend = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
     rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
-    rest: Annotated[int, Option(min=0, help="Number of the frame in which the tissue is unloaded.")] = 0,
+    rest: Annotated[
+        int, Option(min=0, help="Number of the frame in which the tissue is unloaded; forces begin there.")
+    ] = 0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     json: Json = False,
@@ -173,6 +178,7 @@ def estimate(
         membrane_mn_per_mm=membrane_mn_per_mm,
         living=living,
         given=options.given,
+        young_uncertainty=young_uncertainty,
     )
     each, predicted = motions(source, choose_input(source, input), options), []
     for file in predict_files(by_physics, each, source, out, overlay):

@@ -71,7 +71,7 @@ def fields_page() -> str:
         about = (", ".join(field.dims), field.dtype, field.unit, STORED_WHEN[field.stored])
         words = (f"`{field.name}`", *about, sizes, field.meaning)
         lines.append(f"| {' | '.join(words)} |")
-    return _FIELDS_HEAD + "\n".join(lines) + "\n"
+    return _FIELDS_HEAD + "\n".join(lines) + "\n" + _FIELDS_FOOT
 
 
 _FIELDS_HEAD = """\
@@ -96,6 +96,33 @@ and its depth is
 
     Z = f B / (disparity + K_right[0,2] - K[0,2]).
 
+*Camera axes* are OpenCV's: x right, y down, z away from the camera. Those of `force` and `traction` are of
+the camera at rest, of `motion` each frame's own. They differ only where the camera moves.
+
+"""
+_FIELDS_FOOT = """
+## Attributes
+
+Of a sequence, `sequence.attrs`:
+
+| attribute | meaning |
+| --- | --- |
+| `index`, `seed`, `job` | number in the dataset, the job's seed, hash of the job |
+| `frames`, `fps`, `size` | number of frames, frames a second, width and height [px] |
+| `young_kpa`, `poisson` | of the tissue |
+| `scale_mm_per_px` | at the craniotomy's centre |
+| `K`, `distortion` | intrinsic matrix [px], and k1, k2, p1, p2, k3 of OpenCV |
+| `rotation`, `translation` | from world axes to the camera at rest [mm] |
+| `mesh_to_world` | from the axes of a mesh of yours |
+| `right` | the same of a right camera, and `baseline_mm` |
+| `anatomy_id`, `opening_id` | shared by sequences of one brain, of one opening; splits keep them together |
+| `scenario` | what was drawn: gestures (instrument, load, times), tissue, view, appearance, pulse |
+| `mechanics` | by frame energy [mN mm], smallest J, residual; `cautions` of another program's |
+| `flow_backend`, `variant`, `versions` | flow estimator, renderer's variant, versions of packages and code |
+| `summary` | largest flow, motion, force and traction, rounding of flows |
+| `timings` | CPU and wall time by stage [s], peak memory [MB] |
+| `content_hash`, `field_hashes`, `seal_hash` | of all but `timings`, of each field, of the attributes |
+| `format`, `format_version` | of the store |
 """
 
 
@@ -105,8 +132,9 @@ _PROTOCOL_HEAD = """\
 This protocol takes an afternoon. It leads to a recording from which force can be estimated and scored.
 `bench init --protocol RECORDING` writes the list at the end of this page into the recording's folder;
 `bench check RECORDING` says which steps a recording has, and what each missing one costs. The keys are those
-of [`meta.yaml`](../reference/recording.md). The list is written by `make docs` from
-`bench/checks/protocol.yaml`.
+of [`meta.yaml`](../reference/recording.md). In surgery, without a sensor, what counts is: camera, second
+camera, scale, rest and outline; for stiffness and membrane state ranges ([which](../faq.md)). The list is
+written by `make docs` from `bench/checks/protocol.yaml`.
 
 ## Settings
 

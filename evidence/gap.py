@@ -64,7 +64,7 @@ def measure(
     dataset: Path,
     unseen: Path,
     clinical: Path,
-    recordings: Path,
+    recordings: Path | None = None,
     work: Path = Path("runs/gap"),
     fit: int = 375,
     epochs: int = 64,
@@ -75,9 +75,9 @@ def measure(
     """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise.
 
     `dataset`: of which `fit` sequences are used, a fifth of them held out; `unseen`, `clinical`: only tested
-    on; `recordings`: folder of `foreign.recordings`, likewise; `work`: folder of intermediate results, from
-    which an interrupted run continues; `seeds`: networks a training; `kinds`: of `KINDS`, I and R among them;
-    `device`: that trains.
+    on; `recordings`: folder of `foreign.recordings`, likewise, if given; `work`: folder of intermediate
+    results, from which an interrupted run continues; `seeds`: networks a training; `kinds`: of `KINDS`, I and
+    R among them; `device`: that trains.
     """
     tiny = preset("tiny", epochs=epochs)
     # A stem of 4 errs as much as one of 2 in two thirds of the time.
@@ -90,15 +90,16 @@ def measure(
     known = known[:fit]
     split, held_out = parts(known, [*others, *loaded])
     clips = [*known, *others, *loaded]
-    folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
-    if not folders:
-        raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
     tested: dict[str, Sequence[Clip]] = {
         "own": [clips[i] for i in held_out],
         "unseen": others,
         "clinical": loaded,
-        "foreign": [foreign(folder, settings.grid) for folder in folders],
     }
+    if recordings is not None:
+        folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
+        if not folders:
+            raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
+        tested["foreign"] = [foreign(folder, settings.grid) for folder in folders]
     tests = {f"{place}, {flow}": (part, flow) for place, part in tested.items() for flow in FLOWS}
     chosen = kinds.split(",")
     if not {"I", "R"} <= {*chosen} <= {*KINDS}:
@@ -373,7 +374,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
             "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
             "none: what it closes is closed without any knowledge of the force. The ideal flow of recordings "
-            "by felupe and Blender's Cycles is that of the contacts alone. Errors are of the total force, as "
+            "by other programs is that of the contacts alone. Errors are of the total force, as "
             "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
             f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. Where an error "
             "exceeds 100%, assuming no force is better. "
@@ -392,11 +393,16 @@ def page(found: Mapping[str, Any]) -> report.Page:
     )
 
 
+def _places(found: Mapping[str, Any]) -> dict[str, str]:
+    """Names of the places that were tested."""
+    return {place: name for place, name in PLACES.items() if place in found["places"]}
+
+
 def _tables(found: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Section]:
     """Shares closed and errors of one estimator."""
     shares = [
         {"training": kind}
-        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in PLACES.items()}
+        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in _places(found).items()}
         for kind in kinds[1:]
     ]
     tables = [report.Section("", shares, ("Share of the gap closed:",))]
@@ -408,7 +414,7 @@ def _tables(found: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Secti
             {"trained on": kind, "tested on": flow}
             | {
                 name: report.mean_cell(tests[f"{place}, {flow}"], factor=factor)
-                for place, name in PLACES.items()
+                for place, name in _places(found).items()
             }
             for kind, tests in errors.items()
             for flow in (FLOWS if kind != NONE else FLOWS[:1])
@@ -421,7 +427,7 @@ def _sizes(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Shares closed by ridge regression on recovered flow, for each number of fitted sequences."""
     return [
         {"fitted": one["fit"]}
-        | {name: _closed(one["places"][place]["closed"]["R"]) for place, name in PLACES.items()}
+        | {name: _closed(one["places"][place]["closed"]["R"]) for place, name in _places(one).items()}
         for one in found["ridge"]
     ]
 
@@ -429,7 +435,7 @@ def _sizes(found: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
     """Of each place, by how much the gap opens, and what closes it."""
     words = []
-    for place, name in PLACES.items():
+    for place, name in _places(found).items():
         at_place = found["places"][place]
         opened, closes = at_place["opened"], at_place["closed"]
         words.append(
@@ -481,6 +487,6 @@ STUDY = Study(
     measure,
     "gap/results.json",
     page,
-    ("{mission} {mission-ood} {gap-clinical} {work}/foreign --work {work}/gap-study",),
+    ("{mission} {mission-ood} {gap-clinical} --recordings {work}/foreign --work {work}/gap-study",),
     needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
 )

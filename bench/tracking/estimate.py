@@ -26,7 +26,7 @@ from learn.inference.video_motion import (
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Ints, Mask
-from synth.errors import as_positive
+from synth.errors import UserError, as_positive
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.finding import first_fault, judge_young, problems
@@ -40,6 +40,7 @@ def estimate(
     *,
     scale_mm_per_px: float | Literal["unknown"] | None = None,
     young_kpa: float | None = None,
+    young_uncertainty: float = 0.0,
     membrane: MembraneState = "unknown",
     membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
@@ -62,6 +63,7 @@ def estimate(
         source: frames (T, H, W, 3) uint8, a video, a folder of PNGs, a sequence or an .npz of flow.
         scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
+        young_uncertainty: its relative standard deviation, which widens the interval.
         membrane: state of the membrane (pia).
         membrane_mn_per_mm: range of its stiffness, thickness times Young's modulus; None: unknown.
         living: whether heart and breath may move the tissue; False: ex vivo, or a phantom.
@@ -90,7 +92,8 @@ def estimate(
     second = SecondCamera.of(right, calibration, mm_per_unit)
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     motion = read_only(source, motions(source, choose_input(source, input), options))
-    return apply_physics(motion, young_kpa, membrane, membrane_mn_per_mm, living, options.given)
+    known = young_kpa, membrane, membrane_mn_per_mm, living, options.given
+    return apply_physics(motion, *known, young_uncertainty=young_uncertainty)
 
 
 def choose_input(source: Path | Array, given: str | None) -> str:
@@ -118,13 +121,17 @@ def apply_physics(
     membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
     given: tuple[bool, bool] = (False, False),
+    *,
+    young_uncertainty: float = 0.0,
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa` to `living`: as of `estimate`; `given`: as of `VideoOptions`. Returns those of
-    `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus or
-    stiffness.
+    `young_kpa` to `living`, `young_uncertainty`: as of `estimate`; `given`: as of `VideoOptions`. Returns
+    those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus
+    or stiffness.
     """
+    if not 0 <= young_uncertainty < np.inf:
+        raise UserError(f"young_uncertainty {young_uncertainty}: a relative standard deviation, 0 or more")
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
     scale, by, stiff = motion.scale_mm_per_px, motion.recovered_by, membrane_mn_per_mm
@@ -141,7 +148,7 @@ def apply_physics(
         known = [followed.estimates[k] for k in np.flatnonzero(trusted)]
         stated = float(np.mean([*given, membrane != "unknown", not living]))
         video = force_interval.gather(known, followed.moved_mm[trusted], followed.cameras, stated)
-        known, reason = force_interval.bound(known, video, 0.0, by)
+        known, reason = force_interval.bound(known, video, young_uncertainty, by)
         ends[trusted] = [(one.low_mn, one.high_mn) for one in known]
         warnings += [reason] if reason else []
     centre = to_video_px(np.array(physics.view.centre_px), motion)

@@ -2,7 +2,7 @@
 
 import multiprocessing
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -140,20 +140,40 @@ def page(found: Mapping[str, Any]) -> report.Page:
         report.set_log(axes)
         report.legend(axes)
 
+    worst = worst_by_load(found["laws"])
+
     def draw_laws(axes: Axes) -> None:
-        for (law,), own in report.grouped(found["laws"], "law").items():
-            loads = {
-                load: [row["error"] for row in each] for (load,), each in report.grouped(own, "load").items()
-            }
-            worst = {load: 100 * max(errors) for load, errors in loads.items() if None not in errors}
-            axes.plot([*worst], [*worst.values()], "-o", label=law)
+        for law, by_load in worst.items():
+            axes.plot([*by_load], [100 * error for error in by_load.values()], "-o", label=law)
         axes.set(title="Against neo-Hookean, worst direction", xlabel="P = F/(E a2)", ylabel="error [%]")
         report.set_log(axes)
         report.legend(axes)
 
-    sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]
+    words = (
+        "Errors are root mean squares over the opening, relative to the motion. `mesh_error`: against 8,000 "
+        "tetrahedra of the linear law at ν 0.4 (`_049`: at 0.49; `_worst`: of the contacts), so of the mesh "
+        "alone. `error`: against 8,000 neo-Hookean ones at P = 0.3, so of mesh and law.",
+    )
+    laws = [
+        {"law": law} | {f"P {load:g}": f"{error:.1%}" for load, error in by_load.items()}
+        for law, by_load in worst.items()
+    ]
+    sections = [
+        report.Section("Meshes and laws", found["rows"]),
+        report.Section("Error of a law against neo-Hookean, by load", laws, ("Worst direction:",)),
+        report.Section("A sequence", found["sequence"]),
+    ]
     chart = report.chart(draw_cost, draw_laws)
-    return report.Page("Physics: error against cost", found, (), sections, chart)
+    return report.Page("Physics: error against cost", found, words, sections, chart)
+
+
+def worst_by_load(rows: Sequence[Row]) -> dict[str, dict[float, float]]:
+    """Of each law and load P the largest error over directions, of loads that every direction solves."""
+    found: dict[str, dict[float, float]] = {}
+    for (law, load), own in report.grouped(rows, "law", "load").items():
+        if None not in (errors := [row["error"] for row in own]):
+            found.setdefault(law, {})[load] = max(errors)
+    return found
 
 
 STUDY = Study(measure, "fem/pareto/pareto.json", page, needs=("mesh", "mechanics"), timed=True)

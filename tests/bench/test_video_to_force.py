@@ -89,6 +89,17 @@ def test_estimate_and_score_agree_in_force_and_interval(make: Maker, tmp_path: P
             assert (end in found) == (ends is not None), "an interval is stated by both or by neither"
             if ends is not None:
                 assert found[end] == pytest.approx(np.array(ends, np.float64), rel=1e-6, nan_ok=True)
+        low, high, force = (found[name] for name in ("low_mn", "high_mn", "total_force_mn"))
+    about: dict[str, Any] = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "membrane": "stripped"}
+    about |= {"living": False, "tissue": folder / "tissue.png"}
+    wide = bench.estimate(folder / "video.mp4", young_uncertainty=0.4, **about)
+    sure = np.isfinite(high)
+    added = 1.645 * 0.4 * force[sure]
+    assert wide["high_mn"][sure] == pytest.approx(
+        force[sure] + np.hypot(high[sure] - force[sure], added), rel=1e-3
+    )
+    assert (wide["low_mn"][sure] <= low[sure]).all()
+    with np.load(tmp_path / "forces" / "video.npz") as found:
         total = found["density"].sum(axis=(1, 2, 3)) * found["pitch_mm"] ** 2
         assert (total >= 0.95 * np.linalg.norm(found["force_mn"], axis=1)).all(), "lengths sum up to more"
     assert (tmp_path / "forces" / "video.force.csv").stat().st_size > 0

@@ -17,6 +17,7 @@ import pytest
 from fake_model import write_model
 from ruamel.yaml import YAML
 
+import synth
 from bench.recording.from_sequence import export_recording
 from bench.recording.meta import Meta
 from synth.dataset.store import Dataset
@@ -96,6 +97,11 @@ def test_the_help_of_a_job_names_every_job(commands: dict[tuple[str, ...], gener
     (source,) = (param for param in commands["synth", "render"].click.params if param.name == "job")
     assert source.help
     assert set(re.findall(r"[\w-]+", source.help.partition("named job:")[2])) == set(names())
+
+
+def test_every_attribute_of_a_sequence_is_on_its_page() -> None:
+    page = (DOCS / "fields.md").read_text("utf-8")
+    assert not [name for name in synth.sample()[0].attrs if f"`{name}`" not in page]
 
 
 METHODS = "physics", "network and physics", "D2FNet", "mean |flow|"  # columns of the README's table
