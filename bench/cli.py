@@ -126,7 +126,7 @@ def estimate(
     scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
     young: Young = None,
     young_uncertainty: Annotated[
-        float, Option(min=0.0, help="Its relative standard deviation: widens the interval.")
+        float, Option(min=0.0, max=0.999, help="Its relative standard deviation: widens the interval.")
     ] = 0.0,
     membrane: Annotated[MembraneState, Option(help="Of the pia.")] = "unknown",
     membrane_mn_per_mm: Annotated[
@@ -137,7 +137,7 @@ def estimate(
     calibration: Annotated[
         Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
     ] = None,
-    mm_per_unit: Annotated[float, Option(min=1e-9, help="Of the calibration's T.")] = 1.0,
+    mm_per_unit: Annotated[float, Option(min=1e-9, help="mm in one unit of the calibration's T.")] = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     masks: Masks = "auto",
     input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,

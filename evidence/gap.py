@@ -3,8 +3,8 @@
 Trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the error of the
 recovered flow (N), and as a control recovered flow with another sequence's force (S). Each is tested on ideal
 and on recovered flow of held-out sequences, of an unseen appearance and anatomy, of clinical loads, and of
-recordings simulated and rendered by other programs. Twice: by ridge regression, whose solution is unique, and
-by networks, which may not have converged.
+recordings simulated and rendered by other programs. Twice: by ridge regression, in closed form, and by
+networks, whose training may not have converged.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from bench.recording.recording_folder import open_recording
+from bench.tracking.estimate import apply_physics
 from bench.tracking.tracking import track_recording
 from evidence import report, result_cache, result_status, training
 from evidence.curves.models import fit_ridge_on_components
@@ -31,10 +32,12 @@ from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, GridView
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import Predictor, force_size
+from learn.inference.video_motion import motions, read_only
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
 from synth.arrays import Floats, Map
+from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.frame_motion import FrameMotion
@@ -54,6 +57,7 @@ PLACES = {
 }
 """What is tested on; each on ideal and on recovered flow."""
 NONE = "no force"  # the trivial baseline
+PHYSICS = "physics"  # not trained
 _KEY = "force_mae"  # error of a sequence: of the total force [mN]
 _RESAMPLES = 2000
 _INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered", "S": "recovered"}
@@ -112,6 +116,16 @@ def measure(
         made = errors(kind, clips, split, seeded, tests, work, device)
         trained[kind].append(made["errors"])
         curve.setdefault(kind, made["curve"])
+    used = [hashes([clips[i] for i in split.fit]), {name: hashes(part) for name, part in tested.items()}]
+    key = result_cache.key(used)
+    roots = {"own": dataset, "unseen": unseen, "clinical": clinical}
+    ridge, physics = (
+        result_cache.result(work / "runs", name, key, partial(compute, *arguments))
+        for name, compute, *arguments in (
+            ("ridge", ridge_by_size, clips, split.fit, tests, force),
+            ("physics", physics_errors, roots, tested),
+        )
+    )
     noise = fit_noise([clips[i] for i in split.fit])
     sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
@@ -121,8 +135,32 @@ def measure(
         "seeds": seeds,
         "noise": asdict(noise),
         "curve": {kind: curve[kind] for kind in ("I", "R")},
-        "ridge": ridge_by_size(clips, split.fit, tests, force),
-    } | summary(trained, force)
+        "ridge": ridge,
+    } | summary(trained, force, physics)
+
+
+def hashes(clips: Sequence[Clip]) -> list[str]:
+    """Of the contents of clips."""
+    return [clip.content_hash for clip in clips]
+
+
+def physics_errors(roots: Mapping[str, Path], tested: Mapping[str, Sequence[Clip]]) -> Errors:
+    """Errors of physics with E stated and nothing else, as of `ridge_errors`.
+
+    `roots`: dataset of a place; `tested`: of each place the sequences to estimate.
+    """
+    found: Errors = {}
+    for (place, root), flow in product(roots.items(), FLOWS):
+        wanted = {clip.content_hash: k for k, clip in enumerate(tested[place])}
+        off = [np.nan] * len(wanted)
+        for sequence in Dataset(root):
+            if (k := wanted.get(sequence.attrs["content_hash"])) is not None:
+                motion = read_only(sequence.path, motions(sequence.path, flow))
+                # A frame that is held back counts as an answer of no force.
+                size = np.nan_to_num(apply_physics(motion, living=False)["total_force_mn"])
+                off[k] = float(np.abs(size - force_size(tested[place][k].force)).mean())
+        found[f"{place}, {flow}"] = off
+    return found
 
 
 def foreign(folder: Path, grid: Grid) -> Clip:
@@ -262,15 +300,21 @@ def _mean_force(clip: Clip) -> float:
     return float(np.linalg.norm(clip.force, axis=1).mean())
 
 
-def summary(trained: Mapping[str, Sequence[Errors]], force: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+def summary(
+    trained: Mapping[str, Sequence[Errors]],
+    force: Mapping[str, Sequence[float]],
+    physics: Errors | None = None,
+) -> dict[str, Any]:
     """Errors with intervals, also of no force, the factor by which the gap opens, and the shares closed.
 
-    `force`: of each place, the mean forces of its sequences [mN].
+    `force`: of each place, the mean forces of its sequences [mN]; `physics`: errors of physics, if known.
     """
     absolute = {  # means over seeds
         kind: {test: np.mean([run[test] for run in runs], axis=0) for test in runs[0]}
         for kind, runs in trained.items()
     }
+    if physics is not None:
+        absolute[PHYSICS] = {test: np.array(values) for test, values in physics.items()}
     absolute[NONE] = {test: np.array(force[test.split(",")[0]]) for test in absolute["I"]}
     share = {
         kind: {test: values / np.array(force[test.split(",")[0]]) for test, values in tests.items()}
@@ -373,7 +417,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
             "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
-            "none: what it closes is closed without any knowledge of the force. The ideal flow of recordings "
+            "none: what it closes is closed without any knowledge of the force. Physics is not trained; E is "
+            "stated to it and nothing else. The ideal flow of recordings "
             "by other programs is that of the contacts alone. Errors are of the total force, as "
             "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
             f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. Where an error "
@@ -381,7 +426,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "[The same question by four commands](../../howto/gap.md).",
         ),
         [
-            report.Section("Ridge regression: a unique solution, no seed", words=_answer(ridge, KINDS)),
+            report.Section("Ridge regression", words=_answer(ridge, KINDS)),
             *_tables(ridge, KINDS),
             report.Section("Share closed by ridge regression, against fitted sequences", _sizes(found)),
             report.Section(
@@ -412,15 +457,16 @@ def _tables(found: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Secti
     ):
         rows = [
             {"trained on": kind, "tested on": flow}
-            | {
-                name: report.mean_cell(tests[f"{place}, {flow}"], factor=factor)
-                for place, name in _places(found).items()
-            }
+            | {name: _cell(tests, f"{place}, {flow}", factor) for place, name in _places(found).items()}
             for kind, tests in errors.items()
             for flow in (FLOWS if kind != NONE else FLOWS[:1])
         ]
         tables.append(report.Section("", rows, (words,)))
     return tables
+
+
+def _cell(tests: Mapping[str, Sequence[float]], test: str, factor: float) -> str | None:
+    return report.mean_cell(tests[test], factor=factor) if test in tests else None
 
 
 def _sizes(found: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -445,16 +491,17 @@ def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
         if closes["R"]["undefined"]:
             words[-1] += "; there is no gap to close."
             continue
-        words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap"
-        if "S" in kinds:
-            words[-1] += f", the control, which learns to answer zero, {_closed(closes['S'])}"
+        words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap."
         if "N" in kinds:
             low, high = (100 * end for end in at_place["noise_less_real"][1:])
             words[-1] += (
-                f", fitted noise {_closed(closes['N'])} (its error less that after recovered flow: {low:.2g} "
-                f"to {high:.2g} percentage points)"
+                f" Fitted noise closes {_closed(closes['N'])}: after it the error is {low:.2g} to {high:.2g} "
+                "percentage points above that after recovered flow."
             )
-        words[-1] += "."
+        if "S" in kinds:
+            words[-1] += f" The control, which learns to answer zero, closes {_closed(closes['S'])}"
+            lost = closes["S"]["share"] is not None and closes["S"]["share"] < 0
+            words[-1] += ": answering zero errs more than the gap is wide." if lost else "."
         if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
             words[-1] += " There its error is not below that of no force: nothing follows from these shares."
     return words

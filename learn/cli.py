@@ -214,7 +214,7 @@ def predict_command(
     calibration: Annotated[
         Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
     ] = None,
-    mm_per_unit: Annotated[float, Option(min=1e-9, help="Of the calibration's T.")] = 1.0,
+    mm_per_unit: Annotated[float, Option(min=1e-9, help="mm in one unit of the calibration's T.")] = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
@@ -232,7 +232,7 @@ def predict_command(
 
     Exit code 2 if no frame has a force.
     """
-    from learn.inference.apply import apply
+    from learn.inference.apply import apply, check_cameras
     from learn.inference.predict import load_model
     from learn.inference.prediction_file import predict_files, summarise
     from learn.inference.video_motion import SecondCamera, motions, read_options
@@ -245,6 +245,7 @@ def predict_command(
     options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest, second=second)
     predicted = []
     predictor = load_model(model, threads=choose_threads(threads))
+    check_cameras(predictor, second)
     each = motions(source, predictor.choose_source(input), options)
     estimate = partial(apply, predictor, young_kpa=young, membrane=membrane)
     for file in predict_files(estimate, each, source, out, overlay):

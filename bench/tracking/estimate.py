@@ -75,9 +75,9 @@ def estimate(
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
         rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
-        right: pictures of a second camera, of the same moments and in the same form as a video's.
+        right: video, PNGs or frames of a right camera: as many as the left's, each of the same moment.
         calibration: of the two cameras, by OpenCV (K1, D1, K2, D2, R, T), Kalibr or others.
-        mm_per_unit: of the calibration's T.
+        mm_per_unit: millimetres in one unit of the calibration's T.
         input: displacement read from a sequence: recovered or ideal, with two cameras motion or motion-ideal.
 
     Returns:
@@ -130,10 +130,12 @@ def apply_physics(
     those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus
     or stiffness.
     """
-    if not 0 <= young_uncertainty < np.inf:
-        raise UserError(f"young_uncertainty {young_uncertainty}: a relative standard deviation, 0 or more")
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
+    if not 0 <= young_uncertainty < 1:
+        raise UserError(f"young_uncertainty {young_uncertainty}: a relative standard deviation, from 0 to 1")
+    if young_uncertainty and young is None:
+        raise UserError("young_uncertainty: needs young_kpa and the video's scale")
     scale, by, stiff = motion.scale_mm_per_px, motion.recovered_by, membrane_mn_per_mm
     if stiff is not None:
         low, high = (as_positive("membrane_mn_per_mm", end) for end in stiff)

@@ -125,6 +125,8 @@ def drive(
     held = driven_contact.layers([disc], tissue, embedding, surface.vertices, area)
     base, motion = tissue.equations(mesh), trajectory(disc, 3)
     path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *mesh.points.shape)))
+    if not np.isclose(path.way[1, 0], length):
+        raise ValueError(f"the disc went {path.way[1, 0]:.3g} of {length:.3g} mm")
     u = path.displacement[1]
     return held[0].reaction(u, path.way[1, 0]), surface_embedding.embed(mesh, places).move(u)
 
@@ -203,9 +205,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
             f"{worst['estimated']:.1%}.**",
             "felupe solves the same scenes with bricks of 20 nodes, its own Ogden law and its own Newton "
             "iterations (`evidence/fem/felupe_ogden.py`); its elements are converged to 0.2% in force and "
-            "0.6% in motion. Motion is relative to its largest value. A block of 40 x 40 x 20 mm, for the "
-            "estimate of 60 x 60 x 40 mm under a skull with an opening of 12 mm, Poisson's ratio 0.45, "
-            "without membrane and relaxation. Forces are proportional to E.",
+            "0.6% in motion. Motion is relative to its largest value. Discs and balls press a bare "
+            "block of 40 x 40 x 20 mm; the estimate is on one of 60 x 60 x 40 mm, held beyond 12 mm on its "
+            "top as by a skull. Poisson's ratio is 0.45; there is no membrane and no relaxation. Forces are "
+            "proportional to E.",
         ),
         [
             report.Section("A disc that holds the tissue and is driven", driven),

@@ -61,9 +61,9 @@ def predict(
         rate_hz: most frames per second that are used; None: all.
         fps: frames per second of an array or a folder of PNGs.
         rest_frame: number of the video's frame in which the tissue is unloaded; earlier ones are left out.
-        right: pictures of a second camera, of the same moments and in the same form as a video's.
+        right: video, PNGs or frames of a right camera: as many as the left's, each of the same moment.
         calibration: of the two cameras, by OpenCV (K1, D1, K2, D2, R, T), Kalibr or others.
-        mm_per_unit: of the calibration's T.
+        mm_per_unit: millimetres in one unit of the calibration's T.
         input: displacement read from a sequence, as of `learn predict`.
 
     Raises:
@@ -74,8 +74,15 @@ def predict(
     second = SecondCamera.of(right, calibration, mm_per_unit)
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     predictor = model if isinstance(model, Predictor) else load_model(model)
+    check_cameras(predictor, second)
     motion = read_only(source, motions(source, predictor.choose_source(input), options))
     return apply(predictor, motion, young_kpa, membrane)
+
+
+def check_cameras(predictor: Predictor, second: SecondCamera | None) -> None:
+    """UserError: a second camera is given, but the model uses one."""
+    if second is not None and not predictor.card.settings.arch.depth:
+        raise UserError("right: this model uses one camera; `stereo` and `bench estimate` use two")
 
 
 def apply(

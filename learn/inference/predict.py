@@ -146,7 +146,10 @@ class Predictor:
             shift = view.mean(flow.transpose(2, 0, 1) * view.scale_mm_per_px)
             return shift, None if confidence is None else view.mean(confidence)[None]
         if moved is None:
-            raise UserError("this model needs motion in three dimensions: give it stereo or depth images")
+            raise UserError(
+                "this model needs motion in three dimensions: give right and calibration, or a recording "
+                "with a right or depth camera"
+            )
         for what, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
             if values.shape != (height, width, 3):
                 raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import repeat
@@ -25,6 +25,7 @@ from synth.flow.recording.video_track import track_video
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.stereo_track import Moved
 from synth.system import checked_file
+from synth.video import file_numbers
 from synth.video import read_video as video
 from synth.video.mask_files import MaskFiles, read_choice
 from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
@@ -119,8 +120,8 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
-    instead of flow and confidence. Raises UserError for anything else, for a video without a scale, and for a
-    rest frame of what starts at rest.
+    instead of flow and confidence. Raises UserError for anything else, for a video without a scale, for a
+    rest frame or a second camera of stored motion, and for a second camera without a known scale.
     """
     if isinstance(path, np.ndarray) or video.is_video(path):
         yield _video(path, options or VideoOptions())
@@ -184,8 +185,8 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     path = source if isinstance(source, Path) else Path("frames")
     if options.scale_mm_per_px is None:
         raise UserError(f"{path}: a video needs its scale (scale_mm_per_px, --scale): mm/px, or unknown")
-    if isinstance(source, np.ndarray) and (source.dtype != np.uint8 or source.shape[3:] != (3,)):
-        raise UserError(f"{path}: {source.dtype} {source.shape}, expected uint8 (T, H, W, 3)")
+    if isinstance(source, np.ndarray):
+        _check_frames(str(path), source)
     scale_known = options.scale_mm_per_px != "unknown"
     tissue: Callable[[Size], Mask] | None = None
     if isinstance(options.tissue, Path):
@@ -208,7 +209,7 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tissue,
         tool,
         options.rest_frame,
-        depth=_right(options),
+        depth=_right(source, options, taken),
     )
     track = track_video(footage, options.settings, compare_cameras=footage.depth is not None)
     rest, findings = track.video.rest, [*track.video.findings]
@@ -232,18 +233,44 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     )
 
 
-def _right(options: VideoOptions) -> RightVideo | None:
-    """The right camera of a video, if there is one. UserError: the video's scale is unknown."""
+def _right(source: Path | Array, options: VideoOptions, notes: list[str]) -> RightVideo | None:
+    """The right camera of a video, if there is one; `notes` receives how its pictures are counted.
+
+    UserError: the video's scale is unknown, or what is given is no video.
+    """
     second, scale = options.second, options.scale_mm_per_px
     if second is None:
         return None
     if scale is None or isinstance(scale, str):
         raise UserError("right: with a second camera the video's scale in mm/px is needed")
+    if isinstance(second.pictures, np.ndarray):
+        _check_frames("right", second.pictures)
+    elif not video.is_video(second.pictures):
+        raise UserError(f"right: {second.pictures} is neither a video nor a folder of PNGs")
+    frame_of = file_numbers.match_numbers(_numbers(second.pictures), _numbers(source), "right", notes)
     return RightVideo(
-        partial(_pictures, second.pictures, options.fps),
+        lambda: (
+            replace(one, index=frame_of.get(one.index, one.index))
+            for one in _pictures(second.pictures, options.fps)
+        ),
         lambda size: read_rig(second.calibration, size[::-1], second.mm_per_unit),
         scale,
     )
+
+
+def _numbers(source: Path | Array) -> Collection[int]:
+    """Numbers of a video's frames, by which those of two cameras are matched."""
+    if isinstance(source, np.ndarray):
+        return range(len(source))
+    if source.is_dir():
+        return file_numbers.number_files(file_numbers.find_stills(source)).keys()
+    return range(video.count_frames(source) or 0)
+
+
+def _check_frames(what: str, frames: Array) -> None:
+    """UserError unless frames are (T, H, W, 3) uint8."""
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3:
+        raise UserError(f"{what}: {frames.dtype} {frames.shape}, expected uint8 (T, H, W, 3)")
 
 
 def _pictures(source: Path | Array, fps: float) -> Iterator[video.Picture]:

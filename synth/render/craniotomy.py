@@ -72,7 +72,7 @@ def build_craniotomy(
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
     if how.surroundings is None:
-        first = _paint_rim(around, appearance, camera, px_mm, ambient, how.scale)
+        first = _build_rim(around, appearance, camera, px_mm, ambient, how.scale)
         static = [first, *_place_scenery(around, appearance, camera, theatre, surface, first, how.scale)]
     else:
         sizes = opening_mm, 2 * camera.mm_per_px * camera.size[0]
@@ -115,10 +115,10 @@ def _paint_cortex(
     return coat
 
 
-def _paint_rim(
+def _build_rim(
     around: Rim, appearance: Appearance, camera: Camera, px_mm: float, ambient: Floats, scale: float
 ) -> Body:
-    """The rim, painted once it is drawn: where only the truth at rest is needed, that saves a second."""
+    """The rim, painted only when it is first rendered: truth at rest needs no paint, which takes a second."""
     texels = _count_texels(around.extent_mm, 2.2 * px_mm, scale)
     seen = _seen(camera, around.extent_mm, scale)
     paint = partial(rim.paint, around, appearance, texels, seen)
@@ -137,11 +137,11 @@ def _place_scenery(
     camera: Camera,
     theatre: Theatre,
     surface: CortexSurface,
-    painted: Body,
+    rim_body: Body,
     scale: float,
 ) -> list[Body]:
-    """What lies on the rim, the body `painted`: retractor, clips, drapes."""
-    ground, seed = _gather_ground(surface, [painted]), appearance.rim_seed
+    """What lies on the rim, `rim_body`: retractor, clips, drapes."""
+    ground, seed = _gather_ground(surface, [rim_body]), appearance.rim_seed
     placed: list[Body] = []
     if "retractor" in appearance.scenery:
         placed.append(scenery.build_retractor(scale * around.edge, theatre, ground, seed, camera.mm_per_px))

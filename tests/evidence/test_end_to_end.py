@@ -188,7 +188,7 @@ def test_the_gap_of_known_errors() -> None:
         return {test: (of[test.split(", ")[1]] * force).tolist() for test in tests}
 
     trained = {"I": [run(0.1, 0.2)], "R": [run(0.11, 0.125)], "N": [run(0.1, 0.15)], "S": [run(1.0, 1.0)]}
-    found = gap.summary(trained, dict.fromkeys(gap.PLACES, force.tolist()))
+    found = gap.summary(trained, dict.fromkeys(gap.PLACES, force.tolist()), run(0.3, 0.4))
     assert set(found["places"]) == set(gap.PLACES)
     for place in found["places"].values():
         assert place["opened"] == pytest.approx(2)
@@ -196,6 +196,7 @@ def test_the_gap_of_known_errors() -> None:
         assert shares == pytest.approx({"R": 0.75, "N": 0.5, "S": -8})
         assert place["noise_less_real"][0] == pytest.approx(0.025)
     assert found["errors"]["no force"]["own, ideal"][0] == pytest.approx(1)
+    assert found["errors"]["physics"]["own, recovered"][0] == pytest.approx(0.4)
     assert found["errors_mn"]["I"]["own, recovered"][0] == pytest.approx(0.2 * force.mean())
 
 

@@ -27,7 +27,7 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Ste
     if not low <= rig.baseline_mm <= high:
         metres = "; 1000 if T is in metres" if low <= 1000 * np.linalg.norm(translation) <= high else ""
         raise UserError(
-            f"{path}: the cameras are {rig.baseline_mm:.3g} mm apart; write T in mm, or in a recording set "
-            f"stereo.mm_per_unit (the side of a chessboard's square{metres})"
+            f"{path}: the cameras are {rig.baseline_mm:.3g} mm apart; write T in mm, or set mm_per_unit, in "
+            f"a recording stereo.mm_per_unit (the side of a chessboard's square{metres})"
         )
     return rig

@@ -171,13 +171,20 @@ def test_estimate_of_two_videos_is_that_of_their_recording(make: Make) -> None:
     assert (
         np.linalg.norm(both["force_mn"] - one["force_mn"], axis=1).max() > 0.1 * both["total_force_mn"].max()
     )
-    swapped = pair | {"mm_per_unit": 1.0}
-    assert not np.isfinite(bench.estimate(folder / "frames", **about, **swapped)["total_force_mn"]).any()
+    other_unit = pair | {"mm_per_unit": 1.0}
+    assert not np.isfinite(bench.estimate(folder / "frames", **about, **other_unit)["total_force_mn"]).any()
     for missing in pair.keys() - {"mm_per_unit"}:
-        with pytest.raises(UserError, match=missing):
+        with pytest.raises(UserError, match=f"^{missing}:"):
             bench.estimate(folder / "frames", **about, **{k: v for k, v in pair.items() if k != missing})
     with pytest.raises(UserError, match="scale"):
         bench.estimate(folder / "frames", **(about | {"scale_mm_per_px": "unknown"}), **pair)
+    for number in (2, 1, 0):  # counted from 1: matched by their order
+        (folder / f"right/{number:03d}.png").rename(folder / f"right/{number + 1:03d}.png")
+    again = bench.estimate(folder / "frames", **about, **pair)
+    assert again["force_mn"] == pytest.approx(both["force_mn"], rel=1e-9)
+    grey = np.zeros((3, 120, 160), np.uint8)
+    with pytest.raises(UserError, match=r"^right: uint8"):
+        bench.estimate(folder / "frames", **about, **(pair | {"right": grey}))
     with pytest.raises(UserError, match="right"):
         bench.estimate(next(iter(synth.sample())).path, **pair)
 
