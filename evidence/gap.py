@@ -100,10 +100,7 @@ def measure(
         "clinical": loaded,
     }
     if recordings is not None:
-        folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
-        if not folders:
-            raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
-        tested["foreign"] = [foreign(folder, settings.grid) for folder in folders]
+        tested["foreign"] = read_foreign(recordings, settings.grid)
     tests = {f"{place}, {flow}": (part, flow) for place, part in tested.items() for flow in FLOWS}
     chosen = kinds.split(",")
     if not {"I", "R"} <= {*chosen} <= {*KINDS}:
@@ -116,16 +113,13 @@ def measure(
         made = errors(kind, clips, split, seeded, tests, work, device)
         trained[kind].append(made["errors"])
         curve.setdefault(kind, made["curve"])
-    used = [hashes([clips[i] for i in split.fit]), {name: hashes(part) for name, part in tested.items()}]
-    key = result_cache.key(used)
+    parts_used = {"fit": [clips[i] for i in split.fit]} | tested
+    key = result_cache.key({name: list_hashes(part) for name, part in parts_used.items()})
     roots = {"own": dataset, "unseen": unseen, "clinical": clinical}
-    ridge, physics = (
-        result_cache.result(work / "runs", name, key, partial(compute, *arguments))
-        for name, compute, *arguments in (
-            ("ridge", ridge_by_size, clips, split.fit, tests, force),
-            ("physics", physics_errors, roots, tested),
-        )
+    ridge = result_cache.result(
+        work / "runs", "ridge", key, lambda: ridge_by_size(clips, split.fit, tests, force)
     )
+    physics = result_cache.result(work / "runs", "physics", key, lambda: physics_errors(roots, tested))
     noise = fit_noise([clips[i] for i in split.fit])
     sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
@@ -139,13 +133,13 @@ def measure(
     } | summary(trained, force, physics)
 
 
-def hashes(clips: Sequence[Clip]) -> list[str]:
-    """Of the contents of clips."""
+def list_hashes(clips: Sequence[Clip]) -> list[str]:
+    """Hashes of the contents of clips."""
     return [clip.content_hash for clip in clips]
 
 
 def physics_errors(roots: Mapping[str, Path], tested: Mapping[str, Sequence[Clip]]) -> Errors:
-    """Errors of physics with E stated and nothing else, as of `ridge_errors`.
+    """Errors of physics with E stated, and that nothing pulsates, as of `ridge_errors`.
 
     `roots`: dataset of a place; `tested`: of each place the sequences to estimate.
     """
@@ -161,6 +155,14 @@ def physics_errors(roots: Mapping[str, Path], tested: Mapping[str, Sequence[Clip
                 off[k] = float(np.abs(size - force_size(tested[place][k].force)).mean())
         found[f"{place}, {flow}"] = off
     return found
+
+
+def read_foreign(recordings: Path, grid: Grid) -> list[Clip]:
+    """All recordings in a folder of `foreign.recordings`. UserError: there are none."""
+    folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
+    if not folders:
+        raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
+    return [foreign(folder, grid) for folder in folders]
 
 
 def foreign(folder: Path, grid: Grid) -> Clip:
@@ -220,8 +222,8 @@ def ridge_by_size(
     return rows
 
 
-def known_to(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) -> list[Clip]:
-    """The clips as a training of `KINDS` knows them: S with other forces, N with noise for recovered flow,
+def prepare_clips(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) -> list[Clip]:
+    """The clips as a training of `KINDS` gets them: S with other forces, N with noise for recovered flow,
     fitted to those at `fit`."""
     own = list(clips)
     if kind == "S":
@@ -243,7 +245,7 @@ def known_to(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) ->
 def ridge_errors(kind: str, clips: Sequence[Clip], fit: Sequence[int], tests: Tests) -> Errors:
     """Errors of ridge regression on the clips at `fit` as one of `KINDS`: of every test, those of its
     sequences [mN]."""
-    own = known_to(kind, clips, fit, 0)
+    own = prepare_clips(kind, clips, fit, 0)
     estimate = fit_ridge_on_components([own[i] for i in fit], _INPUTS[kind])
     return {
         test: [
@@ -275,7 +277,7 @@ def errors(
         return [row[_KEY] for row in evaluate(predictor, part, source).per_clip()]
 
     def compute() -> dict[str, Any]:
-        own = known_to(kind, clips, split.fit, settings.seed)
+        own = prepare_clips(kind, clips, split.fit, settings.seed)
         alone = replace(split, test=())  # so that other tests need no other training
         final, earlier = training.fit_with_epochs(name, own, alone, settings, work / "models", _SHOWN, device)
         curve = []
@@ -288,8 +290,8 @@ def errors(
             curve.append([epoch, *means])
         return {"errors": {test: score(final, test) for test in tests}, "curve": curve}
 
-    used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
-    tested = {test: [clip.content_hash for clip in part] for test, (part, _) in tests.items()}
+    used = [list_hashes([clips[i] for i in part]) for part in (split.fit, split.select)]
+    tested = {test: list_hashes(part) for test, (part, _) in tests.items()}
     key = result_cache.key(name, settings.model_dump(), used, tested)
     done: dict[str, Any] = result_cache.result(work / "runs", name, key, compute)
     return done
@@ -417,8 +419,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
             "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
-            "none: what it closes is closed without any knowledge of the force. Physics is not trained; E is "
-            "stated to it and nothing else. The ideal flow of recordings "
+            "none: what it closes is closed without any knowledge of the force. Physics is not trained; E "
+            "is stated to it, and that nothing pulsates. The ideal flow of recordings "
             "by other programs is that of the contacts alone. Errors are of the total force, as "
             "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
             f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. Where an error "
