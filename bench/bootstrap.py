@@ -24,15 +24,15 @@ def block_length(x: Floats) -> float:
     variance = float(centred @ centred) / n
     if n < LEAST_SAMPLES or variance == 0:
         return 1.0
-    most = min(n - 1, int(np.ceil(np.sqrt(n))) + max(5, int(np.log10(n))))
-    autocov = np.array([float(centred[: n - k] @ centred[k:]) / n for k in range(2 * most + 1) if k < n])
+    max_lag = min(n - 1, int(np.ceil(np.sqrt(n))) + max(5, int(np.log10(n))))
+    autocov = np.array([float(centred[: n - k] @ centred[k:]) / n for k in range(2 * max_lag + 1) if k < n])
     rho = autocov / variance
     # The smallest lag after which a run of correlations is insignificant.
     run = max(5, int(np.sqrt(np.log10(n))))
     limit = 2 * np.sqrt(np.log10(n) / n)
     small = np.abs(rho[1:]) < limit
-    last = next((k for k in range(len(small) - run + 1) if small[k : k + run].all()), len(small) // 2)
-    reach = min(2 * max(last, 1), len(autocov) - 1)
+    cutoff = next((k for k in range(len(small) - run + 1) if small[k : k + run].all()), len(small) // 2)
+    reach = min(2 * max(cutoff, 1), len(autocov) - 1)
     lag = np.arange(-reach, reach + 1)
     taper = np.clip(2 * (1 - np.abs(lag) / reach), 0, 1)
     cov = autocov[np.abs(lag)]
@@ -49,13 +49,13 @@ def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) 
 
     Politis and Romano, "The stationary bootstrap" (JASA 1994).
     """
-    drawn = np.empty((resamples, n), np.int64)
-    drawn[:, 0] = rng.integers(0, n, resamples)
+    indices = np.empty((resamples, n), np.int64)
+    indices[:, 0] = rng.integers(0, n, resamples)
     fresh = rng.random((resamples, n)) < 1 / max(mean_block, 1.0)
     starts = rng.integers(0, n, (resamples, n))
     for k in range(1, n):
-        drawn[:, k] = np.where(fresh[:, k], starts[:, k], (drawn[:, k - 1] + 1) % n)
-    flat = (drawn + n * np.arange(resamples)[:, None]).ravel()
+        indices[:, k] = np.where(fresh[:, k], starts[:, k], (indices[:, k - 1] + 1) % n)
+    flat = (indices + n * np.arange(resamples)[:, None]).ravel()
     return np.bincount(flat, minlength=resamples * n).reshape(resamples, n).astype(np.float64)
 
 

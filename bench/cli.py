@@ -15,6 +15,7 @@ import typer
 from typer import Argument, Option
 
 from bench.importers.import_formats import list_endings
+from learn.inference.camera_options import Calibration, MmPerUnit, Right
 from synth.errors import UserError, as_user_error
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands, printable
@@ -75,16 +76,16 @@ def score(
     from learn.training.threads import choose_threads
     from synth.video.mask_files import read_choice
 
-    others = _pairs("--also", also, "NAME=FOLDER")
+    others = _parse_pairs("--also", also, "NAME=FOLDER")
     kind, files = read_choice(masks)
-    opened = open_recording(recording, phantom).within(files, _rectangle(region))
-    folder = out or Path(f"{opened.name}-score")
+    opened_recording = open_recording(recording, phantom).restrict(files, _parse_rectangle(region))
+    folder = out or Path(f"{opened_recording.name}-score")
     # NumPy's BLAS too: its threads would compete with the flow for the same cores.
     threadpool_limits(choose_threads())
     result = scoring.score(
-        opened,
+        opened_recording,
         model,
-        methods={name: Model(Path(at)) for name, at in others.items()},
+        methods={name: Model(Path(path)) for name, path in others.items()},
         main=main or (None if model else PHYSICS),
         settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),
         out=folder,
@@ -107,9 +108,9 @@ def _print_result(result: Result, folder: Path) -> None:
     from bench.scoring.headline import headline
     from bench.scoring.score_report import terminal_table
 
-    console, first = Console(), headline(result)
-    doubt = [one.message for one in result.tracked.doubt]
-    for line in filter(None, dict.fromkeys([*doubt, first.refused, *first.warnings])):
+    console, summary = Console(), headline(result)
+    doubts = [finding.message for finding in result.tracked.doubt]
+    for line in filter(None, dict.fromkeys([*doubts, summary.refused, *summary.warnings])):
         console.print(line, style="bold red", markup=False, highlight=False)
     if not result.refused:
         console.print(terminal_table(result))
@@ -133,11 +134,9 @@ def estimate(
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
     ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
-    right: Annotated[Path | None, Option(help="The same video by a second camera, to the right.")] = None,
-    calibration: Annotated[
-        Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
-    ] = None,
-    mm_per_unit: Annotated[float, Option(min=1e-9, help="mm in one unit of the calibration's T.")] = 1.0,
+    right: Right = None,
+    calibration: Calibration = None,
+    mm_per_unit: MmPerUnit = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     masks: Masks = "auto",
     input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,
@@ -180,16 +179,16 @@ def estimate(
         given=options.given,
         young_uncertainty=young_uncertainty,
     )
-    each, predicted = motions(source, choose_input(source, input), options), []
-    for file in predict_files(by_physics, each, source, out, overlay):
-        predicted.append(file)
+    videos, predictions = motions(source, choose_input(source, input), options), []
+    for file in predict_files(by_physics, videos, source, out, overlay):
+        predictions.append(file)
         if not json:
             for note in file.notes:
                 typer.echo(f"note: {file.name}: {note}", err=True)
             typer.echo(file.text)
     if json:
-        print(json_.dumps(summarise(predicted, out)))
-    if all(file.peak_mn is None for file in predicted):
+        print(json_.dumps(summarise(predictions, out)))
+    if all(file.peak_mn is None for file in predictions):
         raise typer.Exit(2)
 
 
@@ -234,20 +233,20 @@ def init(
 ) -> None:
     """Writes a recording's meta.yaml with an explanation of every key."""
     from bench.checks.protocol import as_markdown
-    from bench.recording.meta import commented
+    from bench.recording.meta import document_meta
 
     if tissue and protocol:
         raise UserError("--tissue only proposes tissue.png; leave out --protocol")
     if tissue:
         from bench.recording.propose_tissue import propose_tissue
 
-        mask, shown, doubt = propose_tissue(recording)
-        print(f"wrote {mask}: white on all tissue; edit it in any paint program. On the picture: {shown}")
+        mask, preview, doubt = propose_tissue(recording)
+        print(f"wrote {mask}: white on all tissue; edit it in any paint program. On the picture: {preview}")
         if doubt:
             typer.echo(f"warning: {doubt}", err=True)
         return
-    joins = protocol and (recording / "meta.yaml").exists()
-    files = {} if joins else {"meta.yaml": commented()}
+    keeps_meta = protocol and (recording / "meta.yaml").exists()
+    files = {} if keeps_meta else {"meta.yaml": document_meta()}
     if protocol:
         files["protocol.md"] = as_markdown()
     for name, text in files.items():
@@ -276,12 +275,12 @@ def check(
 
     if picture is not None:
         make_folder(picture.parent)  # fails before the video is decoded
-    found = check_recording(recording, phantom, picture)
-    usable = not first_fault(found)
+    findings = check_recording(recording, phantom, picture)
+    usable = not first_fault(findings)
     if json:
-        print(json_.dumps({"usable": usable, "findings": [asdict(f) for f in found]}))
+        print(json_.dumps({"usable": usable, "findings": [asdict(finding) for finding in findings]}))
     else:
-        for finding in found:
+        for finding in findings:
             print("\n".join(hang(f"{finding.severity:<8}{finding.cause:<11}", printable(finding.message))))
     if not usable:
         raise typer.Exit(2)
@@ -326,19 +325,19 @@ def import_(
     from synth.system.terminal import counting
     from synth.video.pixel_scale import read_scale
 
-    found = importer_registry.read_source(source, _pairs("--use", use, "ROLE=NAME"), stereo_layout)
-    about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
+    intake = importer_registry.read_source(source, _parse_pairs("--use", use, "ROLE=NAME"), stereo_layout)
+    meta_keys: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
-        about["scale_mm_per_px"] = read_scale(scale)
-    with counting(f"importing {source.name}", len(found.times_s)) as progress:
-        importer_registry.write_recording(found, out, newtons, about, progress)
-    notes = list(found.notes)
+        meta_keys["scale_mm_per_px"] = read_scale(scale)
+    with counting(f"importing {source.name}", len(intake.times_s)) as progress:
+        importer_registry.write_recording(intake, out, newtons, meta_keys, progress)
+    notes = list(intake.notes)
     if scale is None:
         notes.append("meta.yaml still needs scale_mm_per_px or calibration")
-    if not len(found.force):
+    if not len(intake.force):
         notes.append("no force: predictions only")
     if json:
-        print(json_.dumps({"recording": str(out), "frames": len(found.times_s), "notes": notes}))
+        print(json_.dumps({"recording": str(out), "frames": len(intake.times_s), "notes": notes}))
     else:
         for note in notes:
             typer.echo(f"note: {note}", err=True)
@@ -362,29 +361,29 @@ def from_dataset(
     from learn.inference.shipped_networks import find_model
     from synth.dataset.store import Dataset
 
-    chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
-    if not chosen:
+    sequences = [entry for entry in Dataset(dataset) if sequence is None or entry.index == sequence]
+    if not sequences:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
     if unseen_by:
-        trained = set[str]().union(*(read_card(find_model(model)).used for model in unseen_by))
-        chosen = [s for s in chosen if s.attrs["content_hash"] not in trained][:1]
-    if not chosen:
+        used_hashes = set[str]().union(*(read_card(find_model(model)).used for model in unseen_by))
+        sequences = [entry for entry in sequences if entry.attrs["content_hash"] not in used_hashes][:1]
+    if not sequences:
         raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")
-    for one in chosen:
-        force_of(one, instrument)  # refused before anything is written
-    names = [str(export_recording(s, out / f"{s.index:06d}", instrument)) for s in chosen]
+    for entry in sequences:
+        force_of(entry, instrument)  # refused before anything is written
+    names = [str(export_recording(entry, out / f"{entry.index:06d}", instrument)) for entry in sequences]
     print(json_.dumps({"recordings": names}) if json else "\n".join(names))
 
 
-def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
+def _parse_pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
     """The A=B values of a repeated option as a dictionary. UserError if one has another form."""
-    named = {}
+    pairs = {}
     for word in words or ():
-        name, sign, value = word.partition("=")
-        if not (name and sign and value):
+        name, separator, value = word.partition("=")
+        if not (name and separator and value):
             raise UserError(f"{option} {word}: expected {form}")
-        named[name] = value
-    return named
+        pairs[name] = value
+    return pairs
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
@@ -418,22 +417,22 @@ def live(
     from synth.video.read_video import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
-    filmed = is_camera(video)
-    if filmed and (files or every):
+    is_filmed = is_camera(video)
+    if is_filmed and (files or every):
         raise UserError(f"{video}: a camera has no files of masks, and its frames don't wait for --every")
-    if seconds is not None and not filmed:
+    if seconds is not None and not is_filmed:
         raise UserError(f"--seconds: {video} is no camera")
-    drawn = tissue or (None if filmed else video.parent / "tissue.png")
-    mask = partial(read_mask, drawn) if drawn and (tissue or drawn.exists()) else None
+    tissue_file = tissue or (None if is_filmed else video.parent / "tissue.png")
+    mask = partial(read_mask, tissue_file) if tissue_file and (tissue or tissue_file.exists()) else None
     threadpool_limits(choose_threads())
     method = None if model is None else Model(model)
     for note in [] if method is None else method.predictor.card.doubt(name_motion(flow)):
         typer.echo(f"warning: network: {note}", err=True)
     with ExitStack() as stack:
         process = stack.enter_context(open_flow_process())
-        camera = stack.enter_context(closing(Camera(video))) if filmed else None
-        read = partial(read_video, video, FPS) if camera is None else camera.pictures
-        footage = Footage(read, str(video), mask, files.read if files else None)
+        camera = stack.enter_context(closing(Camera(video))) if is_filmed else None
+        reader = partial(read_video, video, FPS) if camera is None else camera.pictures
+        footage = Footage(reader, str(video), mask, files.read if files else None)
         stream = live.stream_video(
             footage,
             RecordingFlowSettings(flow, shrink, None, False, kind, LIVE_COLUMNS),
@@ -447,21 +446,23 @@ def live(
             seconds=seconds or math.inf,
         )
     summary = stream.summary()
-    for one in stream.findings:
-        typer.echo(f"{one.severity}: {one.cause}: {one.message}", err=True)
+    for finding in stream.findings:
+        typer.echo(f"{finding.severity}: {finding.cause}: {finding.message}", err=True)
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
-    print(json_.dumps(summary) if json else ", ".join(f"{name} {one:.4g}" for name, one in summary.items()))
+    print(
+        json_.dumps(summary) if json else ", ".join(f"{name} {value:.4g}" for name, value in summary.items())
+    )
 
 
 def _print_frame(frame: LiveFrame) -> None:
     force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
     mark = "" if frame.trusted else "  not trusted"
-    took = f"{1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px"
-    print(f"frame {frame.index:5}  {took}{force}{mark}", flush=True)
+    timing = f"{1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px"
+    print(f"frame {frame.index:5}  {timing}{force}{mark}", flush=True)
 
 
-def _rectangle(text: str) -> tuple[int, int, int, int] | None:
+def _parse_rectangle(text: str) -> tuple[int, int, int, int] | None:
     """Parses LEFT,TOP,WIDTH,HEIGHT; None if empty. UserError for anything else."""
     if not text:
         return None

@@ -33,12 +33,12 @@ print(abs(force - scene.force).max())  # against the true force
 _SECTION = re.compile(r"^(Args|Returns|Raises):$")
 
 
-def write_page(written: str) -> str:
-    """The page; `written` is its note that it is generated."""
+def write_page(note: str) -> str:
+    """The page; `note` says that it is generated."""
     lines = [
         "# The Python packages",
         "",
-        f"{written} Names on this page are stable; modules inside the packages may",
+        f"{note} Names on this page are stable; modules inside the packages may",
         "change. Importing a package loads nothing: each name is looked up when first used.",
         "",
         "Whole programs are in `examples`, with a notebook from a job to a force curve. The shortest:",
@@ -47,19 +47,19 @@ def write_page(written: str) -> str:
         _CHAIN,
         "```",
     ]
-    for name, what in PACKAGES.items():
-        lines += ["", f"## {name}", "", what]
+    for name, summary in PACKAGES.items():
+        lines += ["", f"## {name}", "", summary]
         package = import_module(name)
-        for public in sorted(package.__all__, key=lambda one: (one[0].isupper(), one.lower())):
-            lines += _described(f"{name}.{public}", getattr(package, public))
+        for public in sorted(package.__all__, key=lambda symbol: (symbol[0].isupper(), symbol.lower())):
+            lines += _describe(f"{name}.{public}", getattr(package, public))
     return "\n".join(lines) + "\n"
 
 
-def _described(name: str, value: Any) -> Iterator[str]:
+def _describe(name: str, value: Any) -> Iterator[str]:
     """A function or class as Markdown."""
     yield from ("", f"### {name}", "")
     if not inspect.isclass(value):
-        yield from (f"    {_signed(name, value)}", "", *_markdown(value.__doc__))
+        yield from (f"    {_format_signature(name, value)}", "", *_markdown(value.__doc__))
         return
     yield from _markdown(value.__doc__)
     if issubclass(value, BaseModel):
@@ -70,8 +70,8 @@ def _described(name: str, value: Any) -> Iterator[str]:
     members = list(_members(value))
     if members:
         yield from ("", "| member | what |", "| --- | --- |")
-        for member, what in members:
-            text = " ".join(what.split("\n\n")[0].split()).replace("|", r"\|")
+        for member, summary in members:
+            text = " ".join(summary.split("\n\n")[0].split()).replace("|", r"\|")
             yield f"| `{member}` | {text} |"
 
 
@@ -79,29 +79,30 @@ def _members(value: type) -> Iterator[tuple[str, str]]:
     """Public attributes, properties and methods that have a docstring, in the order of the source."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(value))).body[0]
     assert isinstance(tree, ast.ClassDef)
-    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+    for node, next_node in zip(tree.body, [*tree.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            below = after.value if isinstance(after, ast.Expr) else None
+            below = next_node.value if isinstance(next_node, ast.Expr) else None
             if not node.target.id.startswith("_") and isinstance(below, ast.Constant):
                 yield node.target.id, str(below.value)
         elif isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__call__"):
             text = ast.get_docstring(node)
-            plain = any(
-                isinstance(one, ast.Name) and one.id.endswith("property") for one in node.decorator_list
+            is_property = any(
+                isinstance(decorator, ast.Name) and decorator.id.endswith("property")
+                for decorator in node.decorator_list
             )
-            names = [one.arg for one in node.args.args[1:]]
-            called = "" if node.name == "__call__" else node.name
+            names = [argument.arg for argument in node.args.args[1:]]
+            call_name = "" if node.name == "__call__" else node.name
             if text:
-                yield (node.name if plain else f"{called}({', '.join(names)})"), text
+                yield (node.name if is_property else f"{call_name}({', '.join(names)})"), text
 
 
-def _signed(name: str, function: Any) -> str:
+def _format_signature(name: str, function: Any) -> str:
     """Its signature without types."""
-    shown = [
-        one.replace(annotation=inspect.Parameter.empty)
-        for one in inspect.signature(function).parameters.values()
+    parameters = [
+        parameter.replace(annotation=inspect.Parameter.empty)
+        for parameter in inspect.signature(function).parameters.values()
     ]
-    return name + str(inspect.Signature(shown))
+    return name + str(inspect.Signature(parameters))
 
 
 def _markdown(text: str | None) -> Iterator[str]:

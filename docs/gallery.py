@@ -15,7 +15,7 @@ from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence.rest_scene import RestScene, at_rest
 from synth.sequence.simulation import simulate
-from synth.tune.search import changed
+from synth.tune.search import change_job
 
 Settings = dict[str, Any]  # values of a job's dotted keys
 
@@ -84,16 +84,16 @@ def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, qua
     for name, rows in (("gallery-appearances", families), ("gallery-views", [*views, around])):
         _save(out / f"{name}.webp", rows, quality)
     _save(out / "gallery-loads.webp", [_load(settings, name) for name, settings in _LOADS.items()], quality)
-    job = changed(load_job("randomized"), {"render.stereo_mm": 0, "store.without": (), "sequences": 48})
+    job = change_job(load_job("randomized"), {"render.stereo_mm": 0, "store.without": (), "sequences": 48})
     tiles = [_ready(at_rest(job, index)) for index in range(48)]
     _save(out / "gallery-randomized.webp", [tiles[k : k + 8] for k in range(0, 48, 8)], quality)
 
 
 def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
-    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000, "render.scenery": ()}
-    job = changed(
-        Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],), "fem.instrument": (kind,)} | settings
+    defaults = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000, "render.scenery": ()}
+    job = change_job(
+        Job(seed=seed), defaults | {"fem.gestures": (_GESTURES[kind],), "fem.instrument": (kind,)} | settings
     )
     rest = at_rest(job)
     case = rest.scenario
@@ -105,9 +105,9 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
 
 def _load(settings: Settings, name: str, frames: int = 25) -> list[Pixels]:
     """Frames of a clinical load at 960 × 720: at rest, at a third, at two thirds and at its largest force."""
-    usual: Settings = {"frames": frames, "fps": frames / 3, "render.size": (960, 720), "render.spp": 16}
+    defaults: Settings = {"frames": frames, "fps": frames / 3, "render.size": (960, 720), "render.spp": 16}
     fem = {"fem.young_kpa": 3.0, "fem.membrane.probability": 0.0, "render.scenery": ()}
-    scene = simulate(changed(load_job("clinical"), usual | fem | settings))
+    scene = simulate(change_job(load_job("clinical"), defaults | fem | settings))
     force = np.linalg.norm(scene.force, axis=-1)
     top = scene.strongest
     rising = [int(np.argmin(np.abs(force[: top + 1] - share * force[top]))) for share in (0, 1 / 3, 2 / 3, 1)]

@@ -68,8 +68,8 @@ def fields_page() -> str:
     for field in FIELDS.values():
         per = "" if TIME in field.dims else " a sequence"
         sizes = " | ".join(f"{amount(size)}{per}" for size in field_bytes(field, 1, (480, 640)))
-        about = (", ".join(field.dims), field.dtype, field.unit, STORED_WHEN[field.stored])
-        words = (f"`{field.name}`", *about, sizes, field.meaning)
+        columns = (", ".join(field.dims), field.dtype, field.unit, STORED_WHEN[field.stored])
+        words = (f"`{field.name}`", *columns, sizes, field.meaning)
         lines.append(f"| {' | '.join(words)} |")
     return _FIELDS_HEAD + "\n".join(lines) + "\n" + _FIELDS_FOOT
 
@@ -210,30 +210,35 @@ def _recording() -> str:
     return "\n".join([*head, *_keys(Meta.model_construct(), "")]) + "\n"
 
 
-def _keys(section: BaseModel, at: str) -> list[str]:
+def _keys(section: BaseModel, prefix: str) -> list[str]:
     """A table of a section's keys, followed by the tables of its subsections."""
     rows: list[str] = []
-    inner: list[str] = []
+    subsections: list[str] = []
     for name, field in type(section).model_fields.items():
         default = field.get_default(call_default_factory=True)
         below = section_of(field.annotation)
         if isinstance(default, BaseModel):
-            inner += ["", f"## {at}{name}", "", _sentence(type(default).__doc__)]
-            inner += _keys(default, f"{at}{name}.")
+            subsections += ["", f"## {prefix}{name}", "", _sentence(type(default).__doc__)]
+            subsections += _keys(default, f"{prefix}{name}.")
             continue
         meaning = _sentence(field.description or (below.__doc__ if below else ""))
         limits = job_writer.limits(type(section), name)
         if limits:
             meaning += f" {limits}"
         value = "" if field.is_required() else job_writer.scalar(default)
-        shown = "needed" if field.is_required() else f"`{value}`" if value else "–"
-        rows.append(f"| `{name}` | {shown} | {_cell(meaning)} |")
+        default_text = "needed" if field.is_required() else f"`{value}`" if value else "–"
+        rows.append(f"| `{name}` | {default_text} | {_cell(meaning)} |")
         if below is not None:
-            many = "tuple" in str(field.annotation)
-            inner += ["", f"## {at}{name}{', each of them' if many else ''}", "", _sentence(below.__doc__)]
-            inner += _keys(below.model_construct(), "" if many else f"{at}{name}.")
+            is_list = "tuple" in str(field.annotation)
+            subsections += [
+                "",
+                f"## {prefix}{name}{', each of them' if is_list else ''}",
+                "",
+                _sentence(below.__doc__),
+            ]
+            subsections += _keys(below.model_construct(), "" if is_list else f"{prefix}{name}.")
     table = ["", "| key | default | meaning |", "| --- | --- | --- |", *rows] if rows else []
-    return [*table, *inner]
+    return [*table, *subsections]
 
 
 def _sentence(text: str | None) -> str:
@@ -253,32 +258,35 @@ def _commands() -> str:
             continue
         for line in command.examples:
             lines += ["", f"    {line}"]
-        rows = [_parameter(one) for one in command.click.params if one.name != "help"]
+        rows = [_parameter(parameter) for parameter in command.click.params if parameter.name != "help"]
         if rows:
             lines += ["", "| parameter | default | meaning |", "| --- | --- | --- |", *rows]
     return "\n".join(lines) + "\n"
 
 
-def _parameter(one: Any) -> str:
-    option = one.param_type_name == "option"
-    names = [*one.opts, *one.secondary_opts] if option else [one.name.upper()]
-    default = one.default() if callable(one.default) else one.default
+def _parameter(parameter: Any) -> str:
+    option = parameter.param_type_name == "option"
+    names = [*parameter.opts, *parameter.secondary_opts] if option else [parameter.name.upper()]
+    default = parameter.default() if callable(parameter.default) else parameter.default
     if isinstance(default, (list, tuple)):
         default = " ".join(str(part) for part in default)
-    if one.required:
-        shown = "needed"
-    elif default in (None, "", False) or getattr(one, "is_flag", False):
-        shown = "–"
+    if parameter.required:
+        default_text = "needed"
+    elif default in (None, "", False) or getattr(parameter, "is_flag", False):
+        default_text = "–"
     else:
-        shown = f"`{getattr(default, 'value', default)}`"
-    return f"| {', '.join(f'`{name}`' for name in names)} | {shown} | {_cell(one.help)} |"
+        default_text = f"`{getattr(default, 'value', default)}`"
+    return f"| {', '.join(f'`{name}`' for name in names)} | {default_text} | {_cell(parameter.help)} |"
 
 
 def _contributing() -> str:
     """CONTRIBUTING.md with its table of packages."""
     path = ROOT / "CONTRIBUTING.md"
     head, _, rest = path.read_text("utf-8").partition(_TABLE[0])
-    rows = [f"| `{name.replace('.', '/')}` | {_cell(what)} | {met} |" for name, what, met in _packages()]
+    rows = [
+        f"| `{name.replace('.', '/')}` | {_cell(purpose)} | {imports} |"
+        for name, purpose, imports in _packages()
+    ]
     table = ["", "| package | what | imports from |", "| --- | --- | --- |", *rows, ""]
     return f"{head}{_TABLE[0]}\n" + "\n".join(table) + "\n" + _TABLE[1] + rest.partition(_TABLE[1])[2]
 
@@ -289,24 +297,26 @@ def _packages() -> Iterator[tuple[str, str, str]]:
     folders = {".".join(path.relative_to(ROOT).parts): path for path in paths}
     for name, folder in folders.items():
         trees = {path.stem: ast.parse(path.read_text("utf-8")) for path in folder.glob("*.py")}
-        met = {_package(module, folders) for tree in trees.values() for module in _imported(tree)} - {
+        imports = {_package(module, folders) for tree in trees.values() for module in _list_imports(tree)} - {
             "",
             name,
         }
         home = name.partition(".")[0]
-        inside = sorted(one.partition(".")[2] for one in met if one.startswith(f"{home}."))
+        inside = sorted(package.partition(".")[2] for package in imports if package.startswith(f"{home}."))
         others = [
-            one for one in PACKAGES if one != home and any(f"{at}.".startswith(f"{one}.") for at in met)
+            package
+            for package in PACKAGES
+            if package != home and any(f"{imported}.".startswith(f"{package}.") for imported in imports)
         ]
-        shown = ", ".join(f"`{one}`" for one in [*others, *inside])
+        links = ", ".join(f"`{package}`" for package in [*others, *inside])
         yield (
             name,
             ast.get_docstring(trees["__init__"]) or "",
-            "its own packages" if name in PROGRAMS else shown or "–",
+            "its own packages" if name in PROGRAMS else links or "–",
         )
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
+def _list_imports(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -40,7 +40,7 @@ def status(
     """Whether each stored result stands, or by how much what it depends on has moved; and how it was made."""
     if write:
         states.write_states()
-    typer.echo(report.markdown([one.row() for one in states.gather()]))
+    typer.echo(report.markdown([result.row() for result in states.gather()]))
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ def main(
         work,
         {name: path for name, path in options.items() if path is not None},
         only,
-        standing() if moved else set(),
+        find_standing() if moved else set(),
     )
     for line in left_out:
         typer.echo(line, err=True)
@@ -73,12 +73,12 @@ def main(
     raise typer.Exit(int(any(row["exit_code"] for row in rows if row["name"] not in DATASETS)))
 
 
-def standing() -> set[str]:
+def find_standing() -> set[str]:
     """Names of the studies all of whose results stand."""
-    state = {str(one.file.relative_to(report.RESULTS)): one.stands for one in result_status.gather()}
+    state = {str(status.file.relative_to(report.RESULTS)): status.stands for status in result_status.gather()}
     results = {name: study.load(name).result for name in study.names()}
     files = {name: [file for file in state if fnmatch(file, result)] for name, result in results.items()}
-    return {name for name, mine in files.items() if mine and all(state[file] for file in mine)}
+    return {name for name, matches in files.items() if matches and all(state[file] for file in matches)}
 
 
 def run_steps(steps: Sequence[Step], logs: Path, jobs: int = 1) -> list[dict[str, Any]]:
@@ -99,14 +99,14 @@ def run_steps(steps: Sequence[Step], logs: Path, jobs: int = 1) -> list[dict[str
         return name if name in studies else ""
 
     rows = run([step for step in steps if not owner(step)])
-    apart: dict[str, list[Step]] = {}
+    by_study: dict[str, list[Step]] = {}
     for step in steps:
         if owner(step):
-            apart.setdefault(owner(step), []).append(step)
-    timed = {name for name in apart if study.load(name).timed}
+            by_study.setdefault(owner(step), []).append(step)
+    timed = {name for name in by_study if study.load(name).timed}
     with ThreadPoolExecutor(jobs) as pool:
-        rows += chain(*pool.map(run, [part for name, part in apart.items() if name not in timed]))
-    return rows + run([step for name in sorted(timed) for step in apart[name]])
+        rows += chain(*pool.map(run, [part for name, part in by_study.items() if name not in timed]))
+    return rows + run([step for name in sorted(timed) for step in by_study[name]])
 
 
 def run_step(step: Step, logs: Path) -> dict[str, Any]:
@@ -115,37 +115,38 @@ def run_step(step: Step, logs: Path) -> dict[str, Any]:
     begin = time.perf_counter()
     with (logs / f"{name.replace(' ', '-')}.log").open("wb") as log:
         process = subprocess.Popen([sys.executable, *arguments], stdout=log, stderr=log)
-        _, status, used = os.wait4(process.pid, 0)
+        _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    spent, cpu = time.perf_counter() - begin, used.ru_utime + used.ru_stime
-    typer.echo(f"{name}: exit code {process.returncode}, {spent:.0f} s, {cpu:.0f} of the CPU", err=True)
-    return {"name": name, "exit_code": process.returncode, "wall_s": round(spent, 1), "cpu_s": round(cpu, 1)}
+    wall_s, cpu_s = time.perf_counter() - begin, usage.ru_utime + usage.ru_stime
+    typer.echo(f"{name}: exit code {process.returncode}, {wall_s:.0f} s, {cpu_s:.0f} of the CPU", err=True)
+    times = {"wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1)}
+    return {"name": name, "exit_code": process.returncode} | times
 
 
 def plan(
-    work: Path, given: Mapping[str, Path], only: str = "", left: Sequence[str] | set[str] = ()
+    work: Path, inputs: Mapping[str, Path], only: str = "", excluded: Sequence[str] | set[str] = ()
 ) -> tuple[list[Step], list[str]]:
     """Steps of the studies whose name contains `only`, after those that render their datasets.
 
-    `given`: files by the name of their option; `left`: studies that are left out. Returns also a message for
-    each step that lacks a file.
+    `inputs`: files by the name of their option; `excluded`: studies that are left out. Returns also a message
+    for each step that lacks a file.
     """
-    known = {"work": work, **given, **{name: work / name for name in DATASETS}}
+    placeholders = {"work": work, **inputs, **{name: work / name for name in DATASETS}}
     steps: list[Step] = []
-    left_out, needed = [], set[str]()
+    left_out, used_names = [], set[str]()
     for name in study.names():
-        lines = study.load(name).steps if only in name and name not in left else ()
+        lines = study.load(name).steps if only in name and name not in excluded else ()
         for k, line in enumerate(lines, 1):
             words = set(re.findall(r"\{([\w-]+)\}", line))
-            if missing := sorted(words - set(known)):
+            if missing := sorted(words - set(placeholders)):
                 left_out.append(f"{name} is left out: no --{', --'.join(missing).replace('_', '-')}")
                 continue
-            needed |= words
-            arguments = [word.format_map(known) for word in shlex.split(line)]
+            used_names |= words
+            arguments = [word.format_map(placeholders) for word in shlex.split(line)]
             steps.append((name if len(lines) == 1 else f"{name} {k}", ("-m", "evidence", name, *arguments)))
-    rendered: list[Step] = [
+    render_steps: list[Step] = [
         (name, ("-m", "synth", "render", job, "-o", str(work / name), *changes))
         for name, (job, *changes) in DATASETS.items()
-        if name in needed
+        if name in used_names
     ]
-    return [*rendered, *steps], left_out
+    return [*render_steps, *steps], left_out

@@ -32,7 +32,7 @@ from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, GridView
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import Predictor, force_size
-from learn.inference.video_motion import motions, read_only
+from learn.inference.video_motion import motions, read_single
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
@@ -88,49 +88,49 @@ def measure(
     arch = changed(tiny.arch, output="vector", relative=True, stem=4)
     # By frame, as forces span three decades.
     settings = changed(tiny, arch=arch, loss="mse-frame")
-    known, others, loaded = (
+    own_clips, unseen_clips, clinical_clips = (
         load_clips(root, settings.grid, FLOWS, cache=work) for root in (dataset, unseen, clinical)
     )
-    known = known[:fit]
-    split, held_out = parts(known, [*others, *loaded])
-    clips = [*known, *others, *loaded]
-    tested: dict[str, Sequence[Clip]] = {
+    own_clips = own_clips[:fit]
+    split, held_out = parts(own_clips, [*unseen_clips, *clinical_clips])
+    clips = [*own_clips, *unseen_clips, *clinical_clips]
+    test_clips: dict[str, Sequence[Clip]] = {
         "own": [clips[i] for i in held_out],
-        "unseen": others,
-        "clinical": loaded,
+        "unseen": unseen_clips,
+        "clinical": clinical_clips,
     }
     if recordings is not None:
-        tested["foreign"] = read_foreign(recordings, settings.grid)
-    tests = {f"{place}, {flow}": (part, flow) for place, part in tested.items() for flow in FLOWS}
-    chosen = kinds.split(",")
-    if not {"I", "R"} <= {*chosen} <= {*KINDS}:
+        test_clips["foreign"] = read_foreign(recordings, settings.grid)
+    tests = {f"{place}, {flow}": (part, flow) for place, part in test_clips.items() for flow in FLOWS}
+    chosen_kinds = kinds.split(",")
+    if not {"I", "R"} <= {*chosen_kinds} <= {*KINDS}:
         raise UserError(f"kinds {kinds!r}: I and R, and any of {', '.join(KINDS[2:])}")
-    force = {place: [_mean_force(clip) for clip in part] for place, part in tested.items()}
-    trained: dict[str, list[Errors]] = {kind: [] for kind in chosen}
+    force = {place: [_mean_force(clip) for clip in part] for place, part in test_clips.items()}
+    trainings: dict[str, list[Errors]] = {kind: [] for kind in chosen_kinds}
     curve: dict[str, list[list[float]]] = {}
-    for seed, kind in product(range(seeds), chosen):
+    for seed, kind in product(range(seeds), chosen_kinds):
         seeded = changed(settings, seed=seed, input=_INPUTS[kind])
-        made = errors(kind, clips, split, seeded, tests, work, device)
-        trained[kind].append(made["errors"])
-        curve.setdefault(kind, made["curve"])
-    parts_used = {"fit": [clips[i] for i in split.fit]} | tested
+        result = errors(kind, clips, split, seeded, tests, work, device)
+        trainings[kind].append(result["errors"])
+        curve.setdefault(kind, result["curve"])
+    parts_used = {"fit": [clips[i] for i in split.fit]} | test_clips
     key = result_cache.key({name: list_hashes(part) for name, part in parts_used.items()})
     roots = {"own": dataset, "unseen": unseen, "clinical": clinical}
     ridge = result_cache.result(
         work / "runs", "ridge", key, lambda: ridge_by_size(clips, split.fit, tests, force)
     )
-    physics = result_cache.result(work / "runs", "physics", key, lambda: physics_errors(roots, tested))
+    physics = result_cache.result(work / "runs", "physics", key, lambda: physics_errors(roots, test_clips))
     noise = fit_noise([clips[i] for i in split.fit])
     sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
         "data": result_status.data(dataset, unseen, clinical),
         "settings": settings.model_dump(),
-        "sequences": sizes | {place: len(part) for place, part in tested.items()},
+        "sequences": sizes | {place: len(part) for place, part in test_clips.items()},
         "seeds": seeds,
         "noise": asdict(noise),
         "curve": {kind: curve[kind] for kind in ("I", "R")},
         "ridge": ridge,
-    } | summary(trained, force, physics)
+    } | summary(trainings, force, physics)
 
 
 def list_hashes(clips: Sequence[Clip]) -> list[str]:
@@ -138,23 +138,25 @@ def list_hashes(clips: Sequence[Clip]) -> list[str]:
     return [clip.content_hash for clip in clips]
 
 
-def physics_errors(roots: Mapping[str, Path], tested: Mapping[str, Sequence[Clip]]) -> Errors:
+def physics_errors(roots: Mapping[str, Path], test_clips: Mapping[str, Sequence[Clip]]) -> Errors:
     """Errors of physics with E stated, and that nothing pulsates, as of `ridge_errors`.
 
-    `roots`: dataset of a place; `tested`: of each place the sequences to estimate.
+    `roots`: dataset of a place; `test_clips`: of each place the sequences to estimate.
     """
-    found: Errors = {}
-    for (place, root), flow in product(roots.items(), FLOWS):
-        wanted = {clip.content_hash: k for k, clip in enumerate(tested[place])}
-        off = [np.nan] * len(wanted)
+    by_test: Errors = {}
+    for place, root in roots.items():
+        indices = {clip.content_hash: k for k, clip in enumerate(test_clips[place])}
+        by_flow = {flow: [np.nan] * len(indices) for flow in FLOWS}
         for sequence in Dataset(root):
-            if (k := wanted.get(sequence.attrs["content_hash"])) is not None:
-                motion = read_only(sequence.path, motions(sequence.path, flow))
+            if (k := indices.get(sequence.attrs["content_hash"])) is None:
+                continue
+            for flow, errors_mn in by_flow.items():
+                motion = read_single(sequence.path, motions(sequence.path, flow))
                 # A frame that is held back counts as an answer of no force.
                 size = np.nan_to_num(apply_physics(motion, living=False)["total_force_mn"])
-                off[k] = float(np.abs(size - force_size(tested[place][k].force)).mean())
-        found[f"{place}, {flow}"] = off
-    return found
+                errors_mn[k] = float(np.abs(size - force_size(test_clips[place][k].force)).mean())
+        by_test |= {f"{place}, {flow}": errors_mn for flow, errors_mn in by_flow.items()}
+    return by_test
 
 
 def read_foreign(recordings: Path, grid: Grid) -> list[Clip]:
@@ -162,26 +164,26 @@ def read_foreign(recordings: Path, grid: Grid) -> list[Clip]:
     folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
     if not folders:
         raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
-    return [foreign(folder, grid) for folder in folders]
+    return [read_foreign_clip(folder, grid) for folder in folders]
 
 
-def foreign(folder: Path, grid: Grid) -> Clip:
+def read_foreign_clip(folder: Path, grid: Grid) -> Clip:
     """A recording of `foreign.recordings` with its true flow, and that recovered by `bench score`."""
     recording = open_recording(folder)
     with np.load(folder / TRUTH) as stored:
-        flow, force = stored["flow_px"], stored["force_mn"]
+        true_flow, force = stored["flow_px"], stored["force_mn"]
     young, scale = recording.meta.young_kpa or np.nan, recording.scale.mm_per_px
-    found: dict[int, tuple[Map, Map]] = {}
+    tracked_frames: dict[int, tuple[Map, Map]] = {}
 
     def add(frame: FrameMotion) -> None:
-        found[frame.index] = frame.flow.copy(), frame.confidence.copy()
+        tracked_frames[frame.index] = frame.flow.copy(), frame.confidence.copy()
 
-    tracked = track_recording(recording, {}, scale, RecordingFlowSettings(), each=add)
-    view = GridView(np.asarray(tracked.tissue), scale, grid)
-    at = sorted(found)
-    flows = {"ideal": flow[at], "recovered": np.stack([found[k][0] for k in at])}
-    density = np.zeros((len(at), 3, grid.size, grid.size), np.float32)
-    density[:, :, grid.size // 2, grid.size // 2] = force[at] / (young * grid.pitch_mm**2)
+    tracking = track_recording(recording, {}, scale, RecordingFlowSettings(), on_frame=add)
+    view = GridView(np.asarray(tracking.tissue), scale, grid)
+    numbers = sorted(tracked_frames)
+    flows = {"ideal": true_flow[numbers], "recovered": np.stack([tracked_frames[k][0] for k in numbers])}
+    density = np.zeros((len(numbers), 3, grid.size, grid.size), np.float32)
+    density[:, :, grid.size // 2, grid.size // 2] = force[numbers] / (young * grid.pitch_mm**2)
     return Clip(
         name=folder.name,
         content_hash=result_status.content(folder / TRUTH),
@@ -189,9 +191,9 @@ def foreign(folder: Path, grid: Grid) -> Clip:
         young_kpa=young,
         mask=view.mask,
         displacement={k: view.mean(scale * v.transpose(0, 3, 1, 2)) * view.mask for k, v in flows.items()},
-        confidence=view.mean(np.stack([found[k][1] for k in at])) * view.mask,
+        confidence=view.mean(np.stack([tracked_frames[k][1] for k in numbers])) * view.mask,
         density=density,  # of the sum alone, which is compared
-        force=force[at],
+        force=force[numbers],
     )
 
 
@@ -201,14 +203,14 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     Raises:
         UserError: an anatomy is in both datasets, or too few sequences are left.
     """
-    aside = training.folds(clips, 5, 1)[0]
-    rest = [i for i in range(len(clips)) if i not in set(aside)]
-    inner = training.nested([clips[i] for i in rest], 5, 0, 0)
+    held_out = training.folds(clips, 5, 1)[0]
+    rest = [i for i in range(len(clips)) if i not in set(held_out)]
+    inner = training.split_nested([clips[i] for i in rest], 5, 0, 0)
     fit, select = (tuple(rest[i] for i in part) for part in ((*inner.fit, *inner.test), inner.select))
-    number = groups([*clips, *unseen])
-    if set(number[: len(clips)]) & set(number[len(clips) :]):
+    labels = groups([*clips, *unseen])
+    if set(labels[: len(clips)]) & set(labels[len(clips) :]):
         raise UserError("unseen: shares an anatomy with the other dataset")
-    return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
+    return Split(fit, select, tuple(range(len(clips), len(labels)))), tuple(sorted(held_out))
 
 
 def ridge_by_size(
@@ -225,11 +227,11 @@ def ridge_by_size(
 def prepare_clips(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: int) -> list[Clip]:
     """The clips as a training of `KINDS` gets them: S with other forces, N with noise for recovered flow,
     fitted to those at `fit`."""
-    own = list(clips)
+    prepared = list(clips)
     if kind == "S":
         half = len(clips) // 2
         others = [*clips[half:], *clips[:half]]
-        own = [
+        prepared = [
             replace(clip, density=other.density, force=other.force)
             for clip, other in zip(clips, others, strict=True)
         ]
@@ -238,15 +240,15 @@ def prepare_clips(kind: str, clips: Sequence[Clip], fit: Sequence[int], seed: in
         for k, clip in enumerate(clips):
             rng = np.random.default_rng([seed, k])
             noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
-            own[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
-    return own
+            prepared[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
+    return prepared
 
 
 def ridge_errors(kind: str, clips: Sequence[Clip], fit: Sequence[int], tests: Tests) -> Errors:
     """Errors of ridge regression on the clips at `fit` as one of `KINDS`: of every test, those of its
     sequences [mN]."""
-    own = prepare_clips(kind, clips, fit, 0)
-    estimate = fit_ridge_on_components([own[i] for i in fit], _INPUTS[kind])
+    prepared = prepare_clips(kind, clips, fit, 0)
+    estimate = fit_ridge_on_components([prepared[i] for i in fit], _INPUTS[kind])
     return {
         test: [
             float(np.abs(force_size(estimate(clip, source)) - force_size(clip.force)).mean()) for clip in part
@@ -277,24 +279,26 @@ def errors(
         return [row[_KEY] for row in evaluate(predictor, part, source).per_clip()]
 
     def compute() -> dict[str, Any]:
-        own = prepare_clips(kind, clips, split.fit, settings.seed)
-        alone = replace(split, test=())  # so that other tests need no other training
-        final, earlier = training.fit_with_epochs(name, own, alone, settings, work / "models", _SHOWN, device)
+        prepared = prepare_clips(kind, clips, split.fit, settings.seed)
+        trained_split = replace(split, test=())  # so that other tests need no other training
+        final, earlier = training.fit_with_epochs(
+            name, prepared, trained_split, settings, work / "models", _SHOWN, device
+        )
         curve = []
         for epoch, predictor in earlier.items():
             means = []
             for flow in FLOWS:
                 part, _ = tests[f"own, {flow}"]
-                off = score(predictor, f"own, {flow}")
-                means.append(float(np.mean(np.array(off) / [_mean_force(clip) for clip in part])))
+                errors_mn = score(predictor, f"own, {flow}")
+                means.append(float(np.mean(np.array(errors_mn) / [_mean_force(clip) for clip in part])))
             curve.append([epoch, *means])
         return {"errors": {test: score(final, test) for test in tests}, "curve": curve}
 
-    used = [list_hashes([clips[i] for i in part]) for part in (split.fit, split.select)]
-    tested = {test: list_hashes(part) for test, (part, _) in tests.items()}
-    key = result_cache.key(name, settings.model_dump(), used, tested)
-    done: dict[str, Any] = result_cache.result(work / "runs", name, key, compute)
-    return done
+    split_hashes = [list_hashes([clips[i] for i in part]) for part in (split.fit, split.select)]
+    test_hashes = {test: list_hashes(part) for test, (part, _) in tests.items()}
+    key = result_cache.key(name, settings.model_dump(), split_hashes, test_hashes)
+    result: dict[str, Any] = result_cache.result(work / "runs", name, key, compute)
+    return result
 
 
 def _mean_force(clip: Clip) -> float:
@@ -303,7 +307,7 @@ def _mean_force(clip: Clip) -> float:
 
 
 def summary(
-    trained: Mapping[str, Sequence[Errors]],
+    trainings: Mapping[str, Sequence[Errors]],
     force: Mapping[str, Sequence[float]],
     physics: Errors | None = None,
 ) -> dict[str, Any]:
@@ -313,7 +317,7 @@ def summary(
     """
     absolute = {  # means over seeds
         kind: {test: np.mean([run[test] for run in runs], axis=0) for test in runs[0]}
-        for kind, runs in trained.items()
+        for kind, runs in trainings.items()
     }
     if physics is not None:
         absolute[PHYSICS] = {test: np.array(values) for test, values in physics.items()}
@@ -325,15 +329,17 @@ def summary(
     places = {}
     for place in force:
         ideal = share["I"][f"{place}, ideal"]
-        recovered = {kind: share[kind][f"{place}, recovered"] for kind in trained}
+        recovered = {kind: share[kind][f"{place}, recovered"] for kind in trainings}
         gap = recovered["I"] - ideal
         places[place] = {
             "opened": float(recovered["I"].mean() / ideal.mean()),
             "closed": {
-                kind: closed(gap, recovered["I"] - recovered[kind]) for kind in trained if kind != "I"
+                kind: compute_share(gap, recovered["I"] - recovered[kind])
+                for kind in trainings
+                if kind != "I"
             },
         }
-        if "N" in trained:
+        if "N" in trainings:
             places[place]["noise_less_real"] = difference(recovered["R"], recovered["N"])
     spread, spread_mn = (
         {kind: {test: mean_of(values) for test, values in tests.items()} for kind, tests in part.items()}
@@ -342,7 +348,7 @@ def summary(
     return {"errors": spread, "errors_mn": spread_mn, "places": places}
 
 
-def closed(gap: Floats, gain: Floats) -> dict[str, Any]:
+def compute_share(gap: Floats, gain: Floats) -> dict[str, Any]:
     """Share of the gap closed by a training.
 
     Args:
@@ -354,13 +360,13 @@ def closed(gap: Floats, gain: Floats) -> dict[str, Any]:
     Returns:
         `share` and its 95% `interval` by resampling sequences in pairs, None where `undefined` states why.
     """
-    picks = np.random.default_rng(0).integers(0, len(gap), (_RESAMPLES, len(gap)))
-    below, above = gap[picks].mean(axis=1), gain[picks].mean(axis=1)
-    low, high = np.quantile(below, [0.025, 0.975]).tolist()
+    resamples = np.random.default_rng(0).integers(0, len(gap), (_RESAMPLES, len(gap)))
+    gaps, gains = gap[resamples].mean(axis=1), gain[resamples].mean(axis=1)
+    low, high = np.quantile(gaps, [0.025, 0.975]).tolist()
     if low <= 0 <= high or gap.mean() <= 0:
         reason = f"the gap's interval {low:.3g} to {high:.3g} touches zero: there may be none to close"
         return {"share": None, "interval": None, "undefined": reason}
-    ends = np.quantile(above / below, [0.025, 0.975]).tolist()
+    ends = np.quantile(gains / gaps, [0.025, 0.975]).tolist()
     return {"share": float(gain.mean() / gap.mean()), "interval": ends, "undefined": ""}
 
 
@@ -398,23 +404,23 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
         error = ((r - gain * i) * mask)[1:]
         square += float(np.square(error).sum())
         count += 2 * len(error) * int(inside.sum())
-        both = inside[:, 1:] & inside[:, :-1]
-        neighbours += float((error[..., 1:] * error[..., :-1])[..., both].sum())
-        pairs += 2 * len(error) * int(both.sum())
+        pair_mask = inside[:, 1:] & inside[:, :-1]
+        neighbours += float((error[..., 1:] * error[..., :-1])[..., pair_mask].sum())
+        pairs += 2 * len(error) * int(pair_mask.sum())
     variance = square / max(count, 1)
     rho = float(np.clip(neighbours / max(pairs, 1) / max(variance, 1e-12), 0.01, 0.999))
     # White noise blurred by a Gaussian of s cells has correlation exp(-1 / (4 s²)) between neighbours.
     return Noise(float(gain), float(np.sqrt(variance)), float(np.sqrt(-1 / (4 * np.log(rho)))))
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """The answers, the curve of the networks' trainings, and the tables of both estimators."""
-    kinds = [kind for kind in KINDS if kind in found["errors"]]
-    ridge = found["ridge"][-1]
-    count = ", ".join(f"{number} {name}" for name, number in found["sequences"].items())
+    kinds = [kind for kind in KINDS if kind in data["errors"]]
+    ridge = data["ridge"][-1]
+    count = ", ".join(f"{number} {name}" for name, number in data["sequences"].items())
     return report.Page(
         "Sim-to-real gap: training on recovered flow",
-        found,
+        data,
         (
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
@@ -423,44 +429,45 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "is stated to it, and that nothing pulsates. The ideal flow of recordings "
             "by other programs is that of the contacts alone. Errors are of the total force, as "
             "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
-            f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. Where an error "
+            f"Sequences: {count}; networks a training: {data['seeds']}; 95% BCa intervals. Where an error "
             "exceeds 100%, assuming no force is better. "
             "[The same question by four commands](../../howto/gap.md).",
         ),
         [
             report.Section("Ridge regression", words=_answer(ridge, KINDS)),
             *_tables(ridge, KINDS),
-            report.Section("Share closed by ridge regression, against fitted sequences", _sizes(found)),
-            report.Section(
-                f"D2FNet, after {found['settings']['epochs']} epochs", words=_answer(found, kinds)
-            ),
-            *_tables(found, kinds),
+            report.Section("Share closed by ridge regression, against fitted sequences", _sizes(data)),
+            report.Section(f"D2FNet, after {data['settings']['epochs']} epochs", words=_answer(data, kinds)),
+            *_tables(data, kinds),
         ],
-        report.chart(partial(_draw_curve, curve=found["curve"]), width=720),
+        report.chart(partial(_draw_curve, curve=data["curve"]), width=720),
     )
 
 
-def _places(found: Mapping[str, Any]) -> dict[str, str]:
+def _places(data: Mapping[str, Any]) -> dict[str, str]:
     """Names of the places that were tested."""
-    return {place: name for place, name in PLACES.items() if place in found["places"]}
+    return {place: name for place, name in PLACES.items() if place in data["places"]}
 
 
-def _tables(found: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Section]:
+def _tables(data: Mapping[str, Any], kinds: Sequence[str]) -> list[report.Section]:
     """Shares closed and errors of one estimator."""
     shares = [
         {"training": kind}
-        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in _places(found).items()}
+        | {
+            name: _format_share(data["places"][place]["closed"][kind])
+            for place, name in _places(data).items()
+        }
         for kind in kinds[1:]
     ]
     tables = [report.Section("", shares, ("Share of the gap closed:",))]
-    for words, errors, factor in (
-        ("Errors as shares of the mean force, in percent:", found["errors"], 100.0),
-        ("Errors [mN]:", found["errors_mn"], 1.0),
+    for words, by_kind, factor in (
+        ("Errors as shares of the mean force, in percent:", data["errors"], 100.0),
+        ("Errors [mN]:", data["errors_mn"], 1.0),
     ):
         rows = [
             {"trained on": kind, "tested on": flow}
-            | {name: _cell(tests, f"{place}, {flow}", factor) for place, name in _places(found).items()}
-            for kind, tests in errors.items()
+            | {name: _cell(tests, f"{place}, {flow}", factor) for place, name in _places(data).items()}
+            for kind, tests in by_kind.items()
             for flow in (FLOWS if kind != NONE else FLOWS[:1])
         ]
         tables.append(report.Section("", rows, (words,)))
@@ -471,40 +478,40 @@ def _cell(tests: Mapping[str, Sequence[float]], test: str, factor: float) -> str
     return report.mean_cell(tests[test], factor=factor) if test in tests else None
 
 
-def _sizes(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _sizes(data: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Shares closed by ridge regression on recovered flow, for each number of fitted sequences."""
     return [
-        {"fitted": one["fit"]}
-        | {name: _closed(one["places"][place]["closed"]["R"]) for place, name in _places(one).items()}
-        for one in found["ridge"]
+        {"fitted": row["fit"]}
+        | {name: _format_share(row["places"][place]["closed"]["R"]) for place, name in _places(row).items()}
+        for row in data["ridge"]
     ]
 
 
-def _answer(found: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
+def _answer(data: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
     """Of each place, by how much the gap opens, and what closes it."""
     words = []
-    for place, name in _places(found).items():
-        at_place = found["places"][place]
-        opened, closes = at_place["opened"], at_place["closed"]
+    for place, name in _places(data).items():
+        at_place = data["places"][place]
+        factor, closes = at_place["opened"], at_place["closed"]
         words.append(
-            f"- *{name.capitalize()}*: trained on ideal flow, it errs {opened:.2g} times as much on "
+            f"- *{name.capitalize()}*: trained on ideal flow, it errs {factor:.2g} times as much on "
             "recovered flow as on ideal flow"
         )
         if closes["R"]["undefined"]:
             words[-1] += "; there is no gap to close."
             continue
-        words[-1] += f"; training on recovered flow closes {_closed(closes['R'])} of that gap."
+        words[-1] += f"; training on recovered flow closes {_format_share(closes['R'])} of that gap."
         if "N" in kinds:
             low, high = (100 * end for end in at_place["noise_less_real"][1:])
             words[-1] += (
-                f" Fitted noise closes {_closed(closes['N'])}: after it the error is {low:.2g} to {high:.2g} "
-                "percentage points above that after recovered flow."
+                f" Fitted noise closes {_format_share(closes['N'])}: after it the error is {low:.2g} to "
+                f"{high:.2g} percentage points above that after recovered flow."
             )
         if "S" in kinds:
-            words[-1] += f" The control, which learns to answer zero, closes {_closed(closes['S'])}"
-            lost = closes["S"]["share"] is not None and closes["S"]["share"] < 0
-            words[-1] += ": answering zero errs more than the gap is wide." if lost else "."
-        if found["errors"]["R"][f"{place}, recovered"][2] >= 1:
+            words[-1] += f" The control, which learns to answer zero, closes {_format_share(closes['S'])}"
+            is_worse = closes["S"]["share"] is not None and closes["S"]["share"] < 0
+            words[-1] += ": answering zero errs more than the gap is wide." if is_worse else "."
+        if data["errors"]["R"][f"{place}, recovered"][2] >= 1:
             words[-1] += " There its error is not below that of no force: nothing follows from these shares."
     return words
 
@@ -528,7 +535,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Sequence[Sequence[float]]]) -> N
     report.legend(axes)
 
 
-def _closed(share: Mapping[str, Any]) -> str:
+def _format_share(share: Mapping[str, Any]) -> str:
     return "undefined" if share["undefined"] else report.percent([share["share"], *share["interval"]]) or ""
 
 

@@ -12,11 +12,11 @@ Values = Sequence[float | None] | Floats  # one of each sequence; None or NaN: l
 
 def mean_of(values: Values, seed: int = 0) -> list[float]:
     """Mean, low and high (BCa bootstrap)."""
-    found = interval(np.asarray(values, np.float64), np.random.default_rng(seed))
-    return [found.mean, found.low, found.high]
+    estimate = interval(np.asarray(values, np.float64), np.random.default_rng(seed))
+    return [estimate.mean, estimate.low, estimate.high]
 
 
-def difference(usual: Values, other: Values, seed: int = 0) -> list[float]:
-    """Mean, low and high of `other` less `usual` on the same sequences."""
-    one, two = (np.asarray(values, np.float64) for values in (usual, other))
-    return mean_of(two - one, seed)
+def difference(base: Values, other: Values, seed: int = 0) -> list[float]:
+    """Mean, low and high of `other` less `base` on the same sequences."""
+    first, second = (np.asarray(values, np.float64) for values in (base, other))
+    return mean_of(second - first, seed)

@@ -22,13 +22,13 @@ RIGHT = "right.mp4", "pair.yaml"  # files of a recording's right camera: its vid
 _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers, which the page counts
 
 
-def copy_left(both: Path, left: Path) -> None:
+def copy_left(stereo: Path, mono: Path) -> None:
     """Copies a recording with two cameras without its right one, unless that has been done."""
-    if left.exists():
+    if mono.exists():
         return
-    with checked_file.folder_of(left) as part:
-        shutil.copytree(both, part, ignore=shutil.ignore_patterns(*RIGHT), dirs_exist_ok=True)
-        meta = read_meta(both / "meta.yaml")
+    with checked_file.folder_of(mono) as part:
+        shutil.copytree(stereo, part, ignore=shutil.ignore_patterns(*RIGHT), dirs_exist_ok=True)
+        meta = read_meta(stereo / "meta.yaml")
         recording_writer.write_meta(
             part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"})
         )
@@ -48,5 +48,5 @@ def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
             if code not in (0, _REFUSED):
                 raise UserError(f"bench score: exit code {code}")
     line = shlex.join(["bench", "score", "RECORDING", *options])
-    by = f"{report.command()}\n    {line}\n    bench pool SCORES"
-    pool.write(pool.pool(pool.read(scores)), out, by)
+    provenance = f"{report.command()}\n    {line}\n    bench pool SCORES"
+    pool.write(pool.pool(pool.read(scores)), out, provenance)

@@ -49,21 +49,21 @@ class Page:
     """Words, a chart and tables."""
 
     title: str
-    found: Mapping[str, Any]  # the data: command, commit and machine are listed if they are in it
+    data: Mapping[str, Any]  # command, commit and machine are listed if they are in them
     words: Sequence[str] = ()  # paragraphs at the top; may hold Markdown's `code` and *emphasis*
     sections: Sequence[Section] = ()
     chart: str = ""  # SVG, by `chart`
 
     def text(self) -> str:
         """The page in Markdown: verdict first, provenance last."""
-        made = [f"{key} {self.found[key]}" for key in ("commit", "seed") if key in self.found]
-        made += [f"{key} {value}" for key, value in self.found.get("machine", {}).items()]
+        provenance = [f"{key} {self.data[key]}" for key in ("commit", "seed") if key in self.data]
+        provenance += [f"{key} {value}" for key, value in self.data.get("machine", {}).items()]
         parts = [f"# {self.title}", *self.words, *([f"![{self.title}](chart.svg)"] if self.chart else [])]
         for section in self.sections:
             parts += [f"## {section.heading}"] if section.heading else []
             parts += [*section.words, *([markdown(section.rows)] if section.rows else [])]
-        parts += [f"Made by {', '.join(made)}:"] if made else []
-        parts += [f"    {self.found['command']}"] if "command" in self.found else []
+        parts += [f"Made by {', '.join(provenance)}:"] if provenance else []
+        parts += [f"    {self.data['command']}"] if "command" in self.data else []
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> None:
@@ -75,7 +75,7 @@ class Page:
 
 
 def save(
-    folder: Path, file: str, found: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page] | None = None
+    folder: Path, file: str, data: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page] | None = None
 ) -> None:
     """Writes data and the page drawn from them into a folder, and prints the page's text.
 
@@ -83,20 +83,20 @@ def save(
     children: less than the total where a cache held parts) are put before the data, unless these have them.
     """
     times = os.times()
-    made = {
+    provenance = {
         "command": command(),
         "commit": commit(),
         "date": datetime.date.today().isoformat(),
         "machine": machine(),
         "cpu_hours": float(f"{sum(times[:4]) / 3600:.2g}"),
     }
-    found = shortened(made | dict(found))
+    data = round_floats(provenance | dict(data))
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / file, _json(found) + "\n", durable=False)
+    write_whole(folder / file, _json(data) + "\n", durable=False)
     if page is not None:
-        drawn = page(found)
-        drawn.write(folder)
-        print(drawn.text())
+        document = page(data)
+        document.write(folder)
+        print(document.text())
 
 
 def command() -> str:
@@ -125,16 +125,16 @@ def commit() -> str:
     return f"{name}+" if changed else name
 
 
-def shortened(value: Any) -> Any:
+def round_floats(value: Any) -> Any:
     """A tree with its floats rounded to six digits: the others are noise and take half of a file."""
     if isinstance(value, Mapping):
-        return {key: shortened(part) for key, part in value.items()}
+        return {key: round_floats(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [shortened(part) for part in value]
+        return [round_floats(part) for part in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
+def group_rows(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
     """Rows by their values of some keys, in the order of the first of each."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -145,8 +145,8 @@ def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]
 def mean_cell(values: Sequence[float | None], form: str = ".3g", factor: float = 1.0) -> str:
     """A cell of a table: a mean and the known ends of its interval, each times a factor."""
     mean, *ends = (math.nan if value is None else factor * value for value in values)
-    known = ", ".join(f"{end:{form}}" for end in ends if not math.isnan(end))
-    return f"{mean:{form}} [{known}]" if known else f"{mean:{form}}"
+    ends_text = ", ".join(f"{end:{form}}" for end in ends if not math.isnan(end))
+    return f"{mean:{form}} [{ends_text}]" if ends_text else f"{mean:{form}}"
 
 
 def percent(values: Sequence[float | None] | None) -> str | None:
@@ -170,14 +170,14 @@ def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _json(what: Any, depth: int = 2) -> str:
+def _json(value: Any, depth: int = 2) -> str:
     """JSON with a line for each key and for each row of a list under it: short, and easy to compare."""
-    if depth and isinstance(what, dict) and what:
-        lines = (f"{json.dumps(k)}: {_json(v, depth - 1)}" for k, v in what.items())
+    if depth and isinstance(value, dict) and value:
+        lines = (f"{json.dumps(k)}: {_json(v, depth - 1)}" for k, v in value.items())
         return "{\n" + ",\n".join(lines) + "\n}"
-    if depth and isinstance(what, list) and any(isinstance(item, dict | list) for item in what):
-        return "[\n" + ",\n".join(_json(item, 0) for item in what) + "\n]"
-    return json.dumps(what, separators=(",", ":"))
+    if depth and isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
+        return "[\n" + ",\n".join(_json(item, 0) for item in value) + "\n]"
+    return json.dumps(value, separators=(",", ":"))
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -242,20 +242,20 @@ def scatter(axes: Axes, groups: Mapping[str, Sequence[Row]], x: str, y: str, lab
     that have room.
     """
     points = {(row[x], row[y]): row for rows in groups.values() for row in rows}
-    best = [[*points][k] for k in front([*points])]
-    axes.plot(*zip(*best, strict=True), "--", color="#9aa3ad", linewidth=1)
+    frontier = [[*points][k] for k in front([*points])]
+    axes.plot(*zip(*frontier, strict=True), "--", color="#9aa3ad", linewidth=1)
     for name, rows in groups.items():
-        (drawn,) = axes.plot([row[x] for row in rows], [row[y] for row in rows], " ", marker="o", label=name)
+        (line,) = axes.plot([row[x] for row in rows], [row[y] for row in rows], " ", marker="o", label=name)
         for row in rows:
             if row.get("default"):
-                axes.plot(row[x], row[y], "o", markersize=11, fillstyle="none", color=drawn.get_color())
-    taken: list[np.ndarray[Any, Any]] = []
-    for place in sorted(best, key=lambda place: not points[place].get("default")) if label else ():
-        at = axes.transLimits.transform(axes.transScale.transform(place))
-        if all((abs(at - other) > (0.3, 0.05)).any() for other in taken):
+                axes.plot(row[x], row[y], "o", markersize=11, fillstyle="none", color=line.get_color())
+    positions: list[np.ndarray[Any, Any]] = []
+    for place in sorted(frontier, key=lambda place: not points[place].get("default")) if label else ():
+        position = axes.transLimits.transform(axes.transScale.transform(place))
+        if all((abs(position - other) > (0.3, 0.05)).any() for other in positions):
             text = label.format_map(points[place])
             axes.annotate(text, place, (5, 4), textcoords="offset points", fontsize=7)
-            taken.append(at)
+            positions.append(position)
 
 
 def set_log(axes: Axes, names: str = "xy") -> None:
@@ -266,8 +266,8 @@ def set_log(axes: Axes, names: str = "xy") -> None:
         getattr(axes, f"set_{name}scale")("log")
         axis = getattr(axes, f"{name}axis")
         low, high = axis.get_data_interval()
-        few = math.log10(high / low) < 1.7
-        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1,), numticks=6))
+        is_narrow = math.log10(high / low) < 1.7
+        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if is_narrow else (1,), numticks=6))
         axis.set_minor_locator(ticker.NullLocator())
         axis.set_major_formatter("{x:.4g}")
 

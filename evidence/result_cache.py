@@ -22,8 +22,10 @@ from synth.system.checked_file import write_whole
 @cache
 def libraries() -> dict[str, str]:
     """Versions of the packages that compute, PyTorch's included."""
-    known = packages.versions()
-    return {name: known[name] for name in packages.COMPUTING if name in known} | {"torch": version("torch")}
+    package_versions = packages.versions()
+    return {name: package_versions[name] for name in packages.COMPUTING if name in package_versions} | {
+        "torch": version("torch")
+    }
 
 
 def key(*parts: Any, versions: Sequence[str] = ()) -> str:
@@ -31,9 +33,9 @@ def key(*parts: Any, versions: Sequence[str] = ()) -> str:
 
     `versions`: names of `synth.formats` that the value depends on; all of them if none is named.
     """
-    ours = {name: getattr(formats, name) for name in versions or guard.versions()}
-    described = [formats.motion_version(), libraries(), ours, *parts]
-    return hashlib.blake2b(identity.canonical(described), digest_size=8).hexdigest()
+    code_versions = {name: getattr(formats, name) for name in versions or guard.versions()}
+    inputs = [formats.motion_version(), libraries(), code_versions, *parts]
+    return hashlib.blake2b(identity.canonical(inputs), digest_size=8).hexdigest()
 
 
 def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any:

@@ -46,26 +46,31 @@ class Status:
         """`stands`, `out of date, ...: flow 0.8% (confidence)` or `old`, and `times of DATE`."""
         state = "stands" if self.stands else "old: made before the guard, or without probes"
         if self.moved:
-            state = "out of date, as these have changed: " + ", ".join(one.text() for one in self.moved)
+            state = "out of date, as these have changed: " + ", ".join(change.text() for change in self.moved)
         return f"{state}; times are of {self.date or 'an unknown date'}" if self.timed else state
 
     def row(self) -> dict[str, Any]:
         """Cells of a table."""
         name = str(self.file.relative_to(CHECKOUT)) if self.file.is_relative_to(CHECKOUT) else self.file.name
-        made = {"made": self.date, "commit": self.commit, "CPU-hours": self.cpu_hours}
-        return {"result": name, "state": self.describe(), **made, "command": self.command.split("\n")[0]}
+        provenance = {"made": self.date, "commit": self.commit, "CPU-hours": self.cpu_hours}
+        return {
+            "result": name,
+            "state": self.describe(),
+            **provenance,
+            "command": self.command.split("\n")[0],
+        }
 
 
 def gather(results: Path = RESULTS, today: Sketches | None = None) -> list[Status]:
     """Status of every JSON file of a folder but the guard, by name; `today`: sketches to compare with."""
-    today = guard.stored() if today is None else today
+    today = guard.read_sketches() if today is None else today
     files = sorted(path for path in results.rglob("*.json") if path.name != guard.FILE.name)
     return [_read(file, today) for file in files]
 
 
 def stamp(needs: Iterable[str], timed: bool = False) -> dict[str, Any]:
     """What a result stores about what it depends on: the sketches of its probes, from the stored guard."""
-    today = guard.stored()
+    today = guard.read_sketches()
     return {"timed": timed, "needs": {name: today[name] for name in needs}}
 
 
@@ -102,15 +107,15 @@ def _read(file: Path, today: Mapping[str, Any]) -> Status:
     stored = json.loads(file.read_text("utf-8"))
     stored = stored if isinstance(stored, dict) else {}
     before: Sketches = stored.get("needs", {})
-    moved = tuple(change for change in guard.compare(before, today) if change.moved)
-    about = {key: str(stored.get(key) or "") for key in ("command", "commit", "date")}
+    changes = tuple(change for change in guard.compare(before, today) if change.moved)
+    provenance = {key: str(stored.get(key) or "") for key in ("command", "commit", "date")}
     # A probe that no longer exists can't vouch for anything.
     needs = tuple(before) if set(before) <= set(today) else ()
     return Status(
         file,
-        **about,
+        **provenance,
         cpu_hours=stored.get("cpu_hours"),
         timed=bool(stored.get("timed")),
         needs=needs,
-        moved=moved,
+        moved=changes,
     )

@@ -51,8 +51,8 @@ def names() -> list[str]:
 
 def load(name: str) -> Study:
     """The study of a module."""
-    found: Study = import_module(f"evidence.{name}").STUDY
-    return found
+    study: Study = import_module(f"evidence.{name}").STUDY
+    return study
 
 
 def command(name: str) -> Any:

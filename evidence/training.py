@@ -30,13 +30,13 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
     return [tuple(i for i, k in enumerate(part) if k == fold) for fold in range(count)]
 
 
-def nested(clips: Sequence[Clip], count: int, fold: int, seed: int) -> Split:
+def split_nested(clips: Sequence[Clip], count: int, fold: int, seed: int) -> Split:
     """Split whose test is fold `fold` of `count`; a fifth of the remainder selects the epoch."""
     test = folds(clips, count, seed)[fold]
     rest = [i for i in range(len(clips)) if i not in set(test)]
     inner = [clips[i] for i in rest]
-    chosen = folds(inner, min(5, len(set(groups(inner)))), seed)[0]
-    select = tuple(rest[k] for k in chosen)
+    selected_fold = folds(inner, min(5, len(set(groups(inner)))), seed)[0]
+    select = tuple(rest[k] for k in selected_fold)
     return Split(tuple(i for i in rest if i not in select), select, test)
 
 
@@ -65,8 +65,8 @@ def fit_with_epochs(
     device: str = "cpu",
 ) -> tuple[Predictor, dict[int, Predictor]]:
     """As `fit`, and the networks as they were after some of the epochs, by epoch."""
-    used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
-    key = result_cache.key(settings.model_dump(), used, CLIPS, versions=("TRAINING",))
+    split_hashes = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
+    key = result_cache.key(settings.model_dump(), split_hashes, CLIPS, versions=("TRAINING",))
     model = folder / f"{name}-{key}"
 
     def keep(numbers: Mapping[str, float]) -> None:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from felupe_membrane import speckled
+from felupe_membrane import paint_speckles
 
 import synth
 
@@ -24,9 +24,9 @@ def solve(folder: Path, mm: float = 1.0, mn: float = 1000.0, fine: int = 8) -> d
     rest = np.stack(np.meshgrid(x, x, 0.75 * x[: fine + 1], indexing="ij"), axis=-1).reshape(-1, 3)
     ids, a, b = np.arange(len(rest)).reshape(len(x), len(x), -1), slice(-1), slice(1, None)
     cells = np.c_[*(ids[i, j, k].ravel() for k in (a, b) for i, j in ((a, a), (b, a), (b, b), (a, b)))]
-    top, away = np.isclose(rest[:, 2:], 0), np.hypot(rest[:, 0], rest[:, 1]) / CONTACT_MM
-    ball = np.flatnonzero(top[:, 0] & (away < 1))
-    axis, dent = np.full_like(ball, 3), -DENT_MM / mm * (1 - 0.7 * away[ball] ** 2)  # a ball
+    top, distance = np.isclose(rest[:, 2:], 0), np.hypot(rest[:, 0], rest[:, 1]) / CONTACT_MM
+    ball = np.flatnonzero(top[:, 0] & (distance < 1))
+    axis, dent = np.full_like(ball, 3), -DENT_MM / mm * (1 - 0.7 * distance[ball] ** 2)  # a ball
     young = YOUNG_KPA * mm**2 / mn
     law = f"*HYPERELASTIC,NEO HOOKE\n{young / 4 / (1 + POISSON):.9g},{6 * (1 - 2 * POISSON) / young:.9g}"
     deck = {
@@ -41,16 +41,16 @@ def solve(folder: Path, mm: float = 1.0, mn: float = 1000.0, fine: int = 8) -> d
         for head, rows in deck.items():
             np.savetxt(file, rows, "%.9g", ",", header=head, comments="")
     subprocess.run(["ccx", "block"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    found = {"DISP": [0 * rest], "FORC": [0 * rest]}
+    fields = {"DISP": [0 * rest], "FORC": [0 * rest]}
     for part in (folder / "block.frd").read_text().split("\n -4")[1:]:  # one field of one state
         lines = [line for line in part.splitlines() if line.startswith(" -1")]
-        found[part.split()[0]].append([[float(line[k : k + 12]) for k in (13, 25, 37)] for line in lines])
-    arrays = {"rest": rest / mm, "displacement": found["DISP"], "contact": np.where(top, found["FORC"], 0)}
+        fields[part.split()[0]].append([[float(line[k : k + 12]) for k in (13, 25, 37)] for line in lines])
+    arrays = {"rest": rest / mm, "displacement": fields["DISP"], "contact": np.where(top, fields["FORC"], 0)}
     np.savez(folder / "block.npz", **arrays, hexahedra=cells, times=0.1 * np.arange(STATES))
     return {"source": folder / "block.npz", "unit_mm": mm, "unit_mn": mn, "force": "nodal:contact"}
 
 
-liver = partial(speckled, dark=(0.22, 0.045, 0.035), pale=(0.55, 0.3, 0.15), roughness=0.15)
+liver = partial(paint_speckles, dark=(0.22, 0.045, 0.035), pale=(0.55, 0.3, 0.15), roughness=0.15)
 
 if __name__ == "__main__":
     job = synth.Job.model_validate({**JOB, "mechanics": solve(Path(sys.argv[1]))})

@@ -23,12 +23,12 @@ fat = 1 / (1 + np.exp(1.2 - 0.6 * regions - 0.7 * lobules - 0.4 * grain))[..., N
 albedo = (1 - fat) * [0.22, 0.045, 0.035] + fat * [0.55, 0.30, 0.15]
 normal = np.stack([*np.gradient(-0.15 * lobules)[::-1], np.ones_like(lobules)], axis=-1)
 normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-coat = synth.Coat(*(one.astype(np.float32) for one in (albedo, normal, 1 / (1 + np.exp(1 + regions)))))
+coat = synth.Coat(*(layer.astype(np.float32) for layer in (albedo, normal, 1 / (1 + np.exp(1 + regions)))))
 liver = synth.Wet(coat, roughness=0.04, dry_roughness=0.3, ambient=np.full(3, 0.08))
 block = synth.Body(rest, spatial.Delaunay(uv).simplices, uv.astype(np.float32), liver)
 
 # Lamps next to a pinhole camera 300 mm away, which is tilted by 15 degrees.
-lamps = [synth.Lamp(np.array([at, -10, 300.0]), np.zeros(3), 4.0, np.full(3, 1.6e5)) for at in (-45, 45)]
+lamps = [synth.Lamp(np.array([x_mm, -10, 300.0]), np.zeros(3), 4.0, np.full(3, 1.6e5)) for x_mm in (-45, 45)]
 K = np.array([[2200, 0, 159.5], [0, 2200, 119.5], [0, 0, 1]])
 pose = spatial.transform.Rotation.from_euler("x", 165, degrees=True).as_matrix(), np.array([0, 0, 300.0])
 camera = synth.Camera(K, np.zeros(5), *pose, (320, 240), aperture_mm=0, focus_mm=300, mm_per_px=300 / 2200)

@@ -33,12 +33,12 @@ class Farneback:
         first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (rest, now))
         start = np.zeros((*first.shape, 2), np.float32) if initial is None else initial.copy()
         flags = 0 if initial is None else cv2.OPTFLOW_USE_INITIAL_FLOW
-        found = cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 4, 15, 5, 7, 1.5, flags)
+        flow = cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 4, 15, 5, 7, 1.5, flags)
         y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
         visible = cv2.remap(
-            now_usable.astype(np.float32), x + found[..., 0], y + found[..., 1], cv2.INTER_LINEAR
+            now_usable.astype(np.float32), x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR
         )
-        return np.asarray(found, np.float32), (rest_usable * (visible > 0.9)).astype(np.float32)
+        return np.asarray(flow, np.float32), (rest_usable * (visible > 0.9)).astype(np.float32)
 
 
 def error_px(sequence: synth.Sequence) -> float:

@@ -19,17 +19,17 @@ def make_hook(path: Path) -> None:
     bend = np.column_stack([0.3 - 0.3 * np.cos(turn), 0 * turn, 0.15 + 0.3 * np.sin(turn)])
     middle = np.vstack([[0.0, 0.0, 0.0], bend, [1.0, 0.0, 0.45], [11.0, 0.0, 0.45]])
     radius = np.array([0.04, *np.linspace(0.07, 0.09, 12), 0.12, 0.3])
-    way = np.gradient(middle, axis=0)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    tangents = np.gradient(middle, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    sides = np.cross(way, [0.0, 1.0, 0.0])  # across the hook and, y, through it
-    turned = np.cos(angle)[:, None, None] * [0.0, 1.0, 0.0] + np.sin(angle)[:, None, None] * sides
-    rings = middle + radius[:, None] * turned  # (24, R, 3)
-    here = np.arange(24 * len(middle)).reshape(24, -1)
-    beside = np.roll(here, -1, axis=0)
-    a, b, c, d = here[:, :-1], beside[:, :-1], beside[:, 1:], here[:, 1:]
+    sides = np.cross(tangents, [0.0, 1.0, 0.0])  # across the hook and, y, through it
+    radials = np.cos(angle)[:, None, None] * [0.0, 1.0, 0.0] + np.sin(angle)[:, None, None] * sides
+    rings = middle + radius[:, None] * radials  # (24, R, 3)
+    indices = np.arange(24 * len(middle)).reshape(24, -1)
+    next_indices = np.roll(indices, -1, axis=0)
+    a, b, c, d = indices[:, :-1], next_indices[:, :-1], next_indices[:, 1:], indices[:, 1:]
     tube = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
-    ends = here[:, [0, -1]]
+    ends = indices[:, [0, -1]]
     fans = np.stack([np.broadcast_to(ends[:1], (22, 2)), ends[1:-1], ends[2:]], axis=-1).reshape(-1, 3)
     points = rings.reshape(-1, 3) + np.array([2.0, 0.0, -0.45])
     trimesh.Trimesh(points, np.concatenate([tube, fans])).export(path)

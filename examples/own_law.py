@@ -31,10 +31,10 @@ class Stiffening:
         """Energy (n,) and first Piola-Kirchhoff stress dW/dF (n, 3, 3) [kPa] at gradients F (n, 3, 3)."""
         j = np.linalg.det(f)
         log = np.log(np.where(j > 0, j, np.nan))
-        turned = np.linalg.inv(f).transpose(0, 2, 1)
+        inverse_t = np.linalg.inv(f).transpose(0, 2, 1)
         stretch = np.exp(self.b * (np.einsum("nij,nij->n", f, f) - 3 - 2 * log))
         energy = mu / (2 * self.b) * (stretch - 1) + lam / 2 * log**2
-        first = (mu * stretch)[:, None, None] * (f - turned) + (lam * log)[:, None, None] * turned
+        first = (mu * stretch)[:, None, None] * (f - inverse_t) + (lam * log)[:, None, None] * inverse_t
         return np.where(j > 0, energy, np.inf), np.nan_to_num(first)
 
 

@@ -22,11 +22,11 @@ class Springs:
     def deform(self, rest: synth.RestScene, *_: object) -> synth.Deformation:
         t = np.linspace(0, 1, rest.job.frames)
         bump = np.exp(-0.5 * np.square(rest.shape.vertices[:, :2] / WIDTH_MM).sum(axis=1))
-        moved = np.outer(np.sin(np.pi * t) ** 2, bump)[..., None] * [0.0, 0.0, -DENT_MM]
-        traction = rest.scenario.tissue.young_kpa / DEPTH_MM * moved
+        displacement = np.outer(np.sin(np.pi * t) ** 2, bump)[..., None] * [0.0, 0.0, -DENT_MM]
+        traction = rest.scenario.tissue.young_kpa / DEPTH_MM * displacement
         force = np.einsum("v,tvd->td", rest.vertex_area, traction)
         of_none = dict.fromkeys(("by_instrument", "tip", "shaft"), np.zeros((len(t), 0, 3)))
-        return synth.Deformation(displacement=moved, traction=traction, force=force, **of_none)
+        return synth.Deformation(displacement=displacement, traction=traction, force=force, **of_none)
 
 
 def main(root: Path, job: synth.Job) -> None:

@@ -25,9 +25,9 @@ class Spring:
         self, frame: bench.FrameMotion, scene: bench.MethodContext, picture: bool
     ) -> bench.ForceEstimate:
         """Force from flow (H, W, 2) px and its confidence (H, W), as in the bench's `Method`."""
-        moved_mm = np.linalg.norm(frame.flow, axis=2) * scene.scale_mm_per_px
+        motion_mm = np.linalg.norm(frame.flow, axis=2) * scene.scale_mm_per_px
         young = scene.young_kpa or 1.0  # if unknown the bench scores only the curve's shape
-        size = young * self.mm * np.average(moved_mm, weights=frame.confidence * scene.tissue + 1e-9)
+        size = young * self.mm * np.average(motion_mm, weights=frame.confidence * scene.tissue + 1e-9)
         return bench.ForceEstimate(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 

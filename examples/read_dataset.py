@@ -20,7 +20,7 @@ def describe(sequence: synth.Sequence) -> dict[str, float]:
     traction, area = sequence["traction"][t], sequence["area"][:]  # (H, W, 3) kPa, (H, W) mm2
     labelled = np.linalg.norm(np.einsum("hwk,hw->k", traction, area))  # 1 kPa mm2 = 1 mN
     flow, visible = sequence["flow"][t], sequence["visible"][t]  # (H, W, 2) px, (H, W)
-    found = {
+    numbers = {
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "peak_force_mn": float(force[t]),
         "labelled_force_mn": float(labelled),
@@ -28,8 +28,8 @@ def describe(sequence: synth.Sequence) -> dict[str, float]:
     }
     if "flow_recovered" in sequence:
         error = np.linalg.norm(sequence["flow_recovered"][t] - flow, axis=2)
-        found["median_flow_error_px"] = float(np.median(error[visible]))
-    return found
+        numbers["median_flow_error_px"] = float(np.median(error[visible]))
+    return numbers
 
 
 if __name__ == "__main__":

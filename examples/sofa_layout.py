@@ -19,10 +19,10 @@ JOB["anatomy"] = {"craniotomy": {"point": (0, 0, 0), "direction": (0, 0, 1), "ra
 HEAD = '<VTKFile type="UnstructuredGrid" version="0.1" byte_order="BigEndian">\n<UnstructuredGrid>\n'
 
 
-def array(about: str, values: np.ndarray) -> str:
+def array(attributes: str, values: np.ndarray) -> str:
     """One array of a file, with six digits."""
     numbers = " ".join(f"{value:.6g}" for value in values.flat)
-    return f'<DataArray type={about} format="ascii">\n{numbers}\n</DataArray>\n'
+    return f'<DataArray type={attributes} format="ascii">\n{numbers}\n</DataArray>\n'
 
 
 def write(folder: Path, mm: float = 1000.0, mn: float = 1000.0) -> dict:
@@ -43,8 +43,8 @@ def write(folder: Path, mm: float = 1000.0, mn: float = 1000.0) -> dict:
         (folder / f"tissue{k}.vtu").write_text(f"{head}{body}</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
         lines.append(f"{DT_S * k},0,0,{-FORCE_MN / mn * part:.9g},0,0,0")
     (folder / "force.csv").write_text("\n".join(lines) + "\n")
-    named = {"source": folder / "tissue*.vtu", "force": "force.csv", "dt_s": DT_S}
-    return {**named, "unit_mm": mm, "unit_mn": mn}
+    section = {"source": folder / "tissue*.vtu", "force": "force.csv", "dt_s": DT_S}
+    return {**section, "unit_mm": mm, "unit_mn": mn}
 
 
 if __name__ == "__main__":

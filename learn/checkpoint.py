@@ -82,11 +82,13 @@ class ModelCard:
         exact = not {*RECOVERED}.intersection(sources(self.settings.input))
         if recovered_by in self.motion or (not recovered_by and (exact or self.motion)):
             return []
-        by = " and ".join(self.motion) or ("true" if exact else "")
-        trained = f"was trained on {by} motion" if by else "does not state the motion that it was trained on"
-        given = f", and this is by {recovered_by}" if recovered_by else ""
+        kind = " and ".join(self.motion) or ("true" if exact else "")
+        training = (
+            f"was trained on {kind} motion" if kind else "does not state the motion that it was trained on"
+        )
+        suffix = f", and this is by {recovered_by}" if recovered_by else ""
         return [
-            f"the network {trained}{given}: forces may be off, its intervals are not calibrated; "
+            f"the network {training}{suffix}: forces may be off, its intervals are not calibrated; "
             "train it again on a dataset of this version"
         ]
 
@@ -223,8 +225,8 @@ def disk_needed(folder: Path, settings: TrainingSettings) -> int:
     numbers = sum(math.prod(shape) for shape in _shapes(settings).values())
     # Weights, ONNX, and last.pt with the weights and two moments of each; all twice during replacement. Logs.
     needed = 2 * 5 * 4 * numbers + 2_000_000
-    written = (folder / name for name in (_WEIGHTS, _ONNX, "last.pt"))
-    return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
+    files = (folder / name for name in (_WEIGHTS, _ONNX, "last.pt"))
+    return max(needed - sum(file.stat().st_size for file in files if file.is_file()), 1)
 
 
 def _shapes(settings: TrainingSettings) -> dict[str, tuple[int, ...]]:
@@ -239,8 +241,8 @@ def _find_weights(folder: Path, card: ModelCard) -> Path:
     """The file whose hash the card holds; the next one if writing was interrupted."""
     for file in (folder / _WEIGHTS, folder / _NEXT):
         if file.is_file():
-            with checked_file.open_file(file, _LARGEST_WEIGHTS) as opened:
-                if hashlib.file_digest(opened, _digest).hexdigest() == card.weights_hash:
+            with checked_file.open_file(file, _LARGEST_WEIGHTS) as stream:
+                if hashlib.file_digest(stream, _digest).hexdigest() == card.weights_hash:
                     return file
     if not (folder / _WEIGHTS).is_file():
         raise UserError(f"{folder / _WEIGHTS}: no such file")

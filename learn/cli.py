@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from typer import Argument, Option
 
+from learn.inference.camera_options import Calibration, MmPerUnit, Right
 from synth.errors import UserError
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands
@@ -74,14 +75,14 @@ def train_command(
     from learn.settings import change_preset
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
-    from synth.system.checked_file import made_folder
+    from synth.system.checked_file import open_folder
 
     set_threads(threads)
     device = choose_device(accelerator)
-    dataset, given = _split_arguments(str(dataset), changes or [])
-    settings = change_preset(preset, given)
+    dataset, overrides = _split_arguments(str(dataset), changes or [])
+    settings = change_preset(preset, overrides)
     begin = read_model(find_model(start)) if start else None
-    with made_folder(out, disk_needed(out, settings)):
+    with open_folder(out, disk_needed(out, settings)):
         clips, split = _divide([dataset, *(also or [])], labels or [], settings, cache)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
@@ -210,11 +211,9 @@ def predict_command(
     young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     membrane: Annotated[MembraneState, Option(help="Of the pia, for a model with that input.")] = "unknown",
     scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
-    right: Annotated[Path | None, Option(help="A video by a second camera, to the right.")] = None,
-    calibration: Annotated[
-        Path | None, Option(help="Of both cameras: OpenCV's K1, D1, K2, D2, R, T, Kalibr or others.")
-    ] = None,
-    mm_per_unit: Annotated[float, Option(min=1e-9, help="mm in one unit of the calibration's T.")] = 1.0,
+    right: Right = None,
+    calibration: Calibration = None,
+    mm_per_unit: MmPerUnit = 1.0,
     tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
@@ -243,20 +242,20 @@ def predict_command(
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse)
     second = SecondCamera.of(right, calibration, mm_per_unit)
     options = read_options(read_scale(scale), tissue, masks, settings, rest_frame=rest, second=second)
-    predicted = []
+    predictions = []
     predictor = load_model(model, threads=choose_threads(threads))
     check_cameras(predictor, second)
-    each = motions(source, predictor.choose_source(input), options)
+    videos = motions(source, predictor.choose_source(input), options)
     estimate = partial(apply, predictor, young_kpa=young, membrane=membrane)
-    for file in predict_files(estimate, each, source, out, overlay):
-        predicted.append(file)
+    for file in predict_files(estimate, videos, source, out, overlay):
+        predictions.append(file)
         if not json:
             for note in file.notes:
                 _note(f"{file.name}: {note}")
             _console.print(file.text)
     if json:
-        print(json_.dumps(summarise(predicted, out)))
-    if all(file.peak_mn is None for file in predicted):
+        print(json_.dumps(summarise(predictions, out)))
+    if all(file.peak_mn is None for file in predictions):
         raise typer.Exit(2)
 
 

@@ -44,42 +44,44 @@ def divide(
     test) are used. `seed`: of `keep_back`. UserError for too few groups to split, or an empty fit or select
     part.
     """
-    splits, where = [read_split(dataset) for dataset in datasets], " ".join(map(str, datasets))
+    splits, label = [read_split(dataset) for dataset in datasets], " ".join(map(str, datasets))
     if shared := {dataset_split.by == "opening" for dataset_split in splits if dataset_split.share_anatomy}:
         clips = regroup(clips, "opening" if shared == {True} else "sequence")
         note("Brains may be on several sides of the split: scores don't apply to other brains.")
     names = [clip.content_hash for clip in clips]
     DatasetSplit(sides={k: v for dataset_split in splits for k, v in dataset_split.sides.items()}).find(
-        names, where
+        names, label
     )
     sides = [
         {SIDES.index(dataset_split.sides[name]) for dataset_split in splits if name in dataset_split.sides}
         for name in names
     ]
-    number, last = groups(clips), dict[int, int]()
-    for group, group_sides in zip(number, sides, strict=True):
-        last[group] = max(last.get(group, 0), *group_sides)
+    group_numbers, last_side = groups(clips), dict[int, int]()
+    for group, group_sides in zip(group_numbers, sides, strict=True):
+        last_side[group] = max(last_side.get(group, 0), *group_sides)
     fit, select, test = (
-        tuple(k for k, group in enumerate(number) if sides[k] == {part} == {last[group]}) for part in range(3)
+        tuple(k for k, group in enumerate(group_numbers) if sides[k] == {part} == {last_side[group]})
+        for part in range(3)
     )
-    if left := len(clips) - len(fit) - len(select) - len(test):
-        note(f"{left} sequences are left out: another dataset has their brain on another side.")
+    if excluded := len(clips) - len(fit) - len(select) - len(test):
+        note(f"{excluded} sequences are left out: another dataset has their brain on another side.")
     for side, part in zip(SIDES, (fit, select), strict=False):
         if not part:
-            raise UserError(f"{where}: the {side} side is empty; change it with `synth split --shares`")
+            raise UserError(f"{label}: the {side} side is empty; change it with `synth split --shares`")
     split = Split(fit, select, test, hashes=tuple(dataset_split.hash for dataset_split in splits))
     return clips, keep_back(clips, split, seed)
 
 
 def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
     """The split with a random half of the select part's brains, if enough, moved to the interval part."""
-    number = groups(clips)
-    names = np.unique([number[i] for i in split.select])
+    group_numbers = groups(clips)
+    names = np.unique([group_numbers[i] for i in split.select])
     if len(names) < 2 * conformal.least_units(LEVELS[0]):
         return split
-    drawn = np.random.default_rng([seed, 0x1E7]).permutation(names)[: len(names) // 2]
+    calibration_groups = np.random.default_rng([seed, 0x1E7]).permutation(names)[: len(names) // 2]
     select, calibration = (
-        tuple(i for i in split.select if (number[i] in drawn) == taken) for taken in (False, True)
+        tuple(i for i in split.select if (group_numbers[i] in calibration_groups) == is_calibration)
+        for is_calibration in (False, True)
     )
     return replace(split, select=select, intervals=calibration)
 
@@ -89,19 +91,19 @@ def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> t
 
     UserError: none of them is left.
     """
-    known = {clip.content_hash for clip in clips}
-    new = [label for label in labels if label.content_hash not in known]
+    hashes = {clip.content_hash for clip in clips}
+    new = [label for label in labels if label.content_hash not in hashes]
     if labels and not new:
         raise UserError("--labels: holds the training data itself; give a dataset of other sequences")
-    every = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
-    number = groups(every)
-    other = {number[i] for part in (split.select, split.test, split.intervals) for i in part}
-    more = [i for i in range(len(clips), len(every)) if number[i] not in other]
-    if labels and not more:
+    all_clips = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
+    group_numbers = groups(all_clips)
+    barred = {group_numbers[i] for part in (split.select, split.test, split.intervals) for i in part}
+    added = [i for i in range(len(clips), len(all_clips)) if group_numbers[i] not in barred]
+    if labels and not added:
         raise UserError(
             "--labels: all of its brains are on the other sides of the dataset's split; render others"
         )
-    return every, replace(split, fit=(*split.fit, *more))
+    return all_clips, replace(split, fit=(*split.fit, *added))
 
 
 def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
@@ -109,8 +111,8 @@ def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
     if split.intervals:
         parts["intervals"] = split.intervals
-    number, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
-    if find_crossings([number[i] for i, _ in sides], [side for _, side in sides]):
+    group_numbers, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
+    if find_crossings([group_numbers[i] for i, _ in sides], [side for _, side in sides]):
         raise UserError("the split shares an anatomy between its parts")
     return (
         {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
@@ -123,39 +125,41 @@ def choose_unseen(
 ) -> list[Clip]:
     """Sequences that a model was not trained on; of a training dataset, of its test side. UserError: none."""
     split, candidates = read_split(dataset, required=False), clips
-    known = {name for part in card.split.values() for name in part}
-    if split.sides and any(clip.content_hash in known for clip in clips):
+    training_hashes = {name for part in card.split.values() for name in part}
+    if split.sides and any(clip.content_hash in training_hashes for clip in clips):
         candidates = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = keep_unseen(candidates, card)
-    if not chosen:
+    unseen = keep_unseen(candidates, card)
+    if not unseen:
         raise UserError(
             f"{dataset}: the model was trained on the brains of all {len(candidates)} test sequences; use "
             "other data (`synth split` lists the sides)"
         )
-    if left := len(candidates) - len(chosen):
-        note(f"{left} of {len(candidates)} left out: the model was trained on their brains.")
-    return chosen
+    if excluded := len(candidates) - len(unseen):
+        note(f"{excluded} of {len(candidates)} left out: the model was trained on their brains.")
+    return unseen
 
 
 def keep_unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
-    brains, used = {name for part in USED for name in card.groups.get(part, ())}, card.used
+    brains, used_hashes = {name for part in USED for name in card.groups.get(part, ())}, card.used
     grouped = zip(clips, regroup(clips, find_unit(card)), strict=True)
-    return [c for c, of in grouped if c.content_hash not in used and of.group not in brains]
+    return [
+        c for c, regrouped in grouped if c.content_hash not in used_hashes and regrouped.group not in brains
+    ]
 
 
 def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:
     """Why intervals can't be fitted on these sequences (error model, factors); empty if they can."""
     least = conformal.least_units(LEVELS[0])
-    for what, part, needed in (
+    for purpose, part, needed in (
         ("left for intervals", calibration, least),
         ("left to choose the epoch and to fit the error model", selection, LEAST_SELECTED),
     ):
-        if (held := len(set(groups(part)))) < needed:
-            brains = "brain is" if held == 1 else "brains are"
+        if (count := len(set(groups(part)))) < needed:
+            brains = "brain is" if count == 1 else "brains are"
             return (
-                f"{held} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
-                "validation side, half of which are used (more sequences, or `synth split --shares`)"
+                f"{count} {brains} {purpose}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on "
+                "the validation side, half of which are used (more sequences, or `synth split --shares`)"
             )
     return ""
 

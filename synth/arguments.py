@@ -36,9 +36,11 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         for name, value in list(bound.arguments.items()):
             hint = _hints(function).get(name, Any)  # `self` has none; further keywords any
             if not _fits(value, hint):
-                wanted = re.sub(_ARRAYS, "array", str(function.__annotations__[name]))
-                given = repr(value)[:80] if isinstance(value, (str, Real, Path, list, tuple)) else type(value)
-                raise UserError(f"{title}: {name}: expected {wanted}, got {given}")
+                expected = re.sub(_ARRAYS, "array", str(function.__annotations__[name]))
+                shown_value = (
+                    repr(value)[:80] if isinstance(value, (str, Real, Path, list, tuple)) else type(value)
+                )
+                raise UserError(f"{title}: {name}: expected {expected}, got {shown_value}")
             if isinstance(value, (list, tuple)) and np.ndarray in map(_kind, (hint, *typing.get_args(hint))):
                 bound.arguments[name] = np.asarray(value)
         return function(*bound.args, **bound.kwargs)
@@ -61,7 +63,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return True
     if kind in (Union, UnionType):
         is_blank = Path in args and isinstance(value, str) and not value
-        return not is_blank and any(_fits(value, one) for one in args)
+        return not is_blank and any(_fits(value, member) for member in args)
     if kind is Literal:
         return isinstance(value, str) and value in args
     if kind in (int, float):
@@ -73,10 +75,10 @@ def _fits(value: Any, hint: Any) -> bool:
         except (ValueError, TypeError):  # ragged lists
             return False
     if getattr(kind, "_is_protocol", False) and kind is not Iterable:
-        members = [name for name, one in vars(kind).items() if callable(one) and name[0] != "_"]
+        members = [name for name, attribute in vars(kind).items() if callable(attribute) and name[0] != "_"]
         return all(callable(getattr(value, name, None)) for name in members or ["__call__"])
     if kind in (Sequence, Iterable) and isinstance(value, (str, bytes)):
         return False
     if kind is Sequence and isinstance(value, Sequence):
-        return all(_fits(one, args[0]) for one in value)
+        return all(_fits(item, args[0]) for item in value)
     return isinstance(value, kind)

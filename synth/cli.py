@@ -54,10 +54,10 @@ def tune(
     from synth.job import reader
     from synth.tune import search
 
-    share, loaded = search.parse_budget(budget), reader.load_job(job, overrides or [])
+    share, loaded_job = search.parse_budget(budget), reader.load_job(job, overrides or [])
     out = out or Path(f"{Path(job).stem}.tuned.yaml")
     _refuse_to_replace(out)
-    tuned = search.tune(search.Measurements(loaded), share, probes, checks)
+    tuned = search.tune(search.Measurements(loaded_job), share, probes, checks)
     search.write_job(tuned, job, overrides or [], out)
     print("\n".join([*search.lines(tuned), "", f"wrote {out}"]))
 
@@ -76,17 +76,17 @@ def fit(
     from synth.system.checked_file import write_whole
 
     _refuse_to_replace(out)
-    given = read_photograph(photo, width_mm, mask)
-    found = fitting.fit_camera(given)
+    photograph = read_photograph(photo, width_mm, mask)
+    sections = fitting.fit_camera(photograph)
     lines = [
-        f"# Measured in {photo.name} by synth fit, on {given.cortex_mm2:.0f} mm2 of cortex.",
-        f"# Blur and noise are for pixels of {given.mm_per_px:.4f} mm.",
+        f"# Measured in {photo.name} by synth fit, on {photograph.cortex_mm2:.0f} mm2 of cortex.",
+        f"# Blur and noise are for pixels of {photograph.mm_per_px:.4f} mm.",
     ]
-    for section, keys in found.items():
+    for section, keys in sections.items():
         lines += [f"{section}:", *(f"  {name}: {json_.dumps(value)}" for name, value in keys.items())]
     write_whole(out, "\n".join(lines) + "\n")
     if json:
-        print(json_.dumps({"job": found, "cortex_mm2": given.cortex_mm2, "out": str(out)}))
+        print(json_.dumps({"job": sections, "cortex_mm2": photograph.cortex_mm2, "out": str(out)}))
     else:
         print("\n".join([*lines, f"wrote {out}; draw it with: synth preview {out}"]))
 
@@ -104,7 +104,7 @@ def new(
     """Writes a job file in which every key is explained, or one for another program's simulation."""
     from synth.job import job_writer
 
-    text = job_writer.commented()
+    text = job_writer.document_job()
     if series is not None:
         from synth.publish.series_job import as_job  # here, as it imports the finite elements
 
@@ -151,27 +151,29 @@ def preview(
         raise UserError(f"{out}: cannot be written as PNG")
     if Path(job).is_file() and Path(job).suffix.lower() not in ("", ".yaml", ".yml", ".json"):
         fill_holes = reader.load_job("demo", overrides or []).anatomy.fill_holes
-        chosen = openings.find_openings(Path(job), radius, count, fill_holes)
-        write_picture(out, openings.draw_openings(Path(job), chosen, radius, fill_holes))
-        places = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
-        lines = openings.as_job(Path(job), chosen, radius, fill_holes)
+        candidates = openings.find_openings(Path(job), radius, count, fill_holes)
+        write_picture(out, openings.draw_openings(Path(job), candidates, radius, fill_holes))
+        places = [
+            opening.craniotomy(radius).model_dump(include={"point", "direction"}) for opening in candidates
+        ]
+        lines = openings.as_job(Path(job), candidates, radius, fill_holes)
         text = f"# {out} shows these craniotomies, the best first\n{lines}"
         print(json_.dumps({"sheet": str(out), "openings": places}) if json else text)
         return
-    read = reader.load_job(job, overrides or [])
-    if read.mechanics.source is not None and not json:
-        print(read_job_series(read, 0).summary)
+    loaded_job = reader.load_job(job, overrides or [])
+    if loaded_job.mechanics.source is not None and not json:
+        print(read_job_series(loaded_job, 0).summary)
     with counting("Compiling the first time, then drawing") as progress:
-        picture = contact_sheet.draw_sheet(read, count, progress)
+        picture = contact_sheet.draw_sheet(loaded_job, count, progress)
     write_picture(out, picture)
-    disk_bytes = estimate(read) * read.sequences
+    disk_bytes = estimate(loaded_job) * loaded_job.sequences
     if json:
         print(json_.dumps({"sheet": str(out), "disk_bytes": disk_bytes}))
         return
     print(
         f"wrote {out}, each view at most {contact_sheet.TILE_PX} px wide\n"
-        f"the whole job: {read.sequences} sequences of {read.frames} frames, {amount(disk_bytes)} of disk; "
-        "`synth status` gives its time once a sequence is done"
+        f"the whole job: {loaded_job.sequences} sequences of {loaded_job.frames} frames, "
+        f"{amount(disk_bytes)} of disk; `synth status` gives its time once a sequence is done"
     )
 
 
@@ -190,9 +192,11 @@ def _read_series(job: Job) -> tuple[str, ...]:
 
 def _print_doubts(cautions: Mapping[str, Sequence[int]]) -> None:
     """Prints what is doubtful about another program's series, each with the sequences of which it is."""
-    for text, those in cautions.items():
-        of = "" if len(those) == 1 and those[0] == 0 else f" ({len(those)} sequences, first {those[0]:06d})"
-        print(f"warning: mechanics.source: {text}{of}", file=sys.stderr)
+    for text, sequences in cautions.items():
+        extent = f" ({len(sequences)} sequences, first {sequences[0]:06d})"
+        if len(sequences) == 1 and sequences[0] == 0:
+            extent = ""
+        print(f"warning: mechanics.source: {text}{extent}", file=sys.stderr)
 
 
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
@@ -220,15 +224,15 @@ def render(
     from synth.job.reader import load_job
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it as Ctrl-C does
-    read = load_job(job, overrides or [])
-    doubts = _read_series(read)
-    of = None if part is None else parse_part(part)
+    loaded_job = load_job(job, overrides or [])
+    doubts = _read_series(loaded_job)
+    run_part = None if part is None else parse_part(part)
     if retry:
-        Folder(out, of).clear_failures()
-    options = Options(engine, workers, gpus, memory, mix_versions=mix_versions, part=of)
+        Folder(out, run_part).clear_failures()
+    options = Options(engine, workers, gpus, memory, mix_versions=mix_versions, part=run_part)
     with RunBars() as bars:
-        summary = run_job(read, out, options, bars)
-    _print_doubts({text: those for text, those in summary.cautions.items() if text not in doubts})
+        summary = run_job(loaded_job, out, options, bars)
+    _print_doubts({text: sequences for text, sequences in summary.cautions.items() if text not in doubts})
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
     else:
@@ -237,8 +241,9 @@ def render(
             print(f"  {index:06d} failed: {reason}", file=sys.stderr)
         if summary.failed:
             print(f"  their logs are in {Folder(out).logs}", file=sys.stderr)
-    if not summary.already and read.card.authors == type(read.card)().authors:  # in the first run only
-        licence = f"its licence is {read.card.licence}" if read.card.licence else "it has no licence"
+    card = loaded_job.card
+    if not summary.already and card.authors == type(card)().authors:  # in the first run only
+        licence = f"its licence is {card.licence}" if card.licence else "it has no licence"
         print(
             f"note: the card names no author, and {licence}: set card.authors and card.licence in the job "
             "and run the command again, which changes only the card",
@@ -255,8 +260,8 @@ def status(out: Out, json: Json = False) -> None:
 
     from synth.engine.status import lines, read_status
 
-    found = read_status(out)
-    print(json_.dumps(asdict(found)) if json else "\n".join(lines(found)))
+    progress = read_status(out)
+    print(json_.dumps(asdict(progress)) if json else "\n".join(lines(progress)))
 
 
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
@@ -275,13 +280,13 @@ def split_command(
 
     folder = Folder(out)
     radius_mm = folder.job().anatomy.craniotomy.radius_mm
-    chosen = sequence_split.parse_rule(
+    rule = sequence_split.parse_rule(
         by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening")
     )
-    rows = index.write_index(folder, chosen)
+    rows = index.write_index(folder, rule)
     write_card(folder)
     counts = sequence_split.count(rows)
-    if chosen.share_anatomy:
+    if rule.share_anatomy:
         print("warning: sides may share a brain: test scores don't hold for other brains", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
@@ -294,10 +299,10 @@ def report(out: Out) -> None:
     from synth.publish.card import write_card
 
     folder = Folder(out)
-    stated = folder.job().card
+    card = folder.job().card
     write_index(folder)
     print(write_card(folder))
-    if missing := ", ".join(name for name in ("authors", "licence") if not getattr(stated, name)):
+    if missing := ", ".join(name for name in ("authors", "licence") if not getattr(card, name)):
         print(f"not in the job's card, so not in the description: {missing}", file=sys.stderr)
 
 
@@ -320,8 +325,8 @@ def export(
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which removes what is half-written
     options = {}
     if to == "video":
-        drawn = overlay and [name for name in overlay if name != "none"]
-        options = {"overlays": drawn, "interval_s": _interval(interval)}
+        overlays = overlay and [name for name in overlay if name != "none"]
+        options = {"overlays": overlays, "interval_s": _interval(interval)}
     elif overlay or interval:
         raise UserError("--overlay and --interval need --to video")
     print(f"{export_dataset(out, target, to, **options)} sequences in {target}")
@@ -366,18 +371,18 @@ def view(
     """Draws frames of a sequence with their flow and force map side by side, as in the README."""
     from synth.dataset import location
     from synth.dataset.store import open_sequence
-    from synth.publish.picture import draw_sequence, strongest, write_animation
+    from synth.publish.picture import draw_sequence, find_strongest, write_animation
     from synth.system.checked_file import write_picture
 
-    moving = save.suffix.lower() == ".webp"
-    if not moving and save.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+    is_animation = save.suffix.lower() == ".webp"
+    if not is_animation and save.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise UserError(f"{save}: its name must end with .png, .jpg or .webp")
-    chosen = open_sequence(location.store(out, sequence))
-    numbers = frame or ([*range(chosen.frames)] if moving else [strongest(chosen)])
-    rows = draw_sequence(chosen, numbers)
+    shown_sequence = open_sequence(location.store(out, sequence))
+    numbers = frame or ([*range(shown_sequence.frames)] if is_animation else [find_strongest(shown_sequence)])
+    rows = draw_sequence(shown_sequence, numbers)
     save.parent.mkdir(parents=True, exist_ok=True)
-    if moving:
-        write_animation(save, rows, len(numbers), chosen.attrs["fps"])
+    if is_animation:
+        write_animation(save, rows, len(numbers), shown_sequence.attrs["fps"])
     else:
         write_picture(save, rows)
     print(f"wrote {save}")
@@ -390,5 +395,5 @@ def doctor(
     """Reports what this machine offers, what it lacks, and how to fix that."""
     from synth.system.doctor import diagnose, lines
 
-    found = diagnose(folder)
-    print(json_.dumps([vars(one) for one in found]) if json else "\n".join(lines(found)))
+    findings = diagnose(folder)
+    print(json_.dumps([vars(finding) for finding in findings]) if json else "\n".join(lines(findings)))

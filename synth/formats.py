@@ -26,12 +26,12 @@ def motion_version() -> str:
     return f"{MOTION}-{hashlib.blake2b(weights, digest_size=4).hexdigest()}"
 
 
-def check_format(found: object, current: int, where: str) -> None:
-    """Raises UserError if the format version `found` in `where` is neither `current` nor the one before."""
-    readable = [version for version in (current, current - 1) if version >= FIRST]
-    if type(found) is not int or found not in readable:
+def check_format(version: object, current: int, label: str) -> None:
+    """Raises UserError if the format version `version` in `label` is neither `current` nor the one before."""
+    readable = [number for number in (current, current - 1) if number >= FIRST]
+    if type(version) is not int or version not in readable:
         known = " and ".join(map(str, readable))
         raise UserError(
-            f"{where}: written by format {str(found)[:40]}; this version reads {known}: create it again, or "
-            "use the version that wrote it"
+            f"{label}: written by format {str(version)[:40]}; this version reads {known}: create it again, "
+            "or use the version that wrote it"
         )

@@ -57,9 +57,9 @@ def make(
     device = choose_device(device).type
     counts = {"randomized": randomized, "mission": mission}
     files = {job: list(_render(job, count, folder / "sequences")) for job, count in counts.items()}
-    sequences = [file for some in files.values() for file in some]
+    sequences = [file for paths in files.values() for file in paths]
     generator = " ".join(sorted({str(np.load(file)["generator"]) for file in sequences}))
-    about = {"seed": seed, "sequences": {job: len(some) for job, some in files.items()}}
+    common = {"seed": seed, "sequences": {job: len(paths) for job, paths in files.items()}}
     below: dict[str, str] = {}
     for part in (segmentation, correction, depth_correction):
         name = part.__name__.rpartition(".")[2]
@@ -68,23 +68,24 @@ def make(
         if part is segmentation:
             settings = {"steps": steps, "device": device, "pace": pace}
             settings["start"] = None if start is None else _short_hash(start)
-        card = {**about, **settings, "below": dict(below)}
+        card = {**common, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
-        made = folder / f"{name}-{key}.onnx"
-        if not (made.exists() and made.with_suffix(".json").exists()):  # the card is written last
+        onnx_file = folder / f"{name}-{key}.onnx"
+        if not (onnx_file.exists() and onnx_file.with_suffix(".json").exists()):  # the card is written last
             net: torch.nn.Module
             if part is segmentation:
-                frames, checkpoint = [dict(np.load(file)) for file in sequences], made.with_suffix(".ckpt")
+                frames = [dict(np.load(file)) for file in sequences]
+                checkpoint = onnx_file.with_suffix(".ckpt")
                 net, data = segmentation_training.train(frames, steps, seed, checkpoint, device, start, pace)
             else:
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
-            export(net, made, card | data | {"generator": generator}, part.CHANNELS)
+            export(net, onnx_file, card | data | {"generator": generator}, part.CHANNELS)
         weights = folder / "made" / f"{name}.onnx"
         weights.parent.mkdir(exist_ok=True)
         for suffix in (".onnx", ".json"):
-            shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
-        vars(part).update(WEIGHTS=made)  # the next part learns from what is recovered with these
+            shutil.copy(onnx_file.with_suffix(suffix), weights.with_suffix(suffix))
+        vars(part).update(WEIGHTS=onnx_file)  # the next part learns from what is recovered with these
         below[name] = _short_hash(weights)
 
 
@@ -99,7 +100,7 @@ def _render(job: str, count: int, folder: Path) -> Iterator[Path]:
         file, refused = folder / f"{job}-{index}.npz", folder / f"{job}-{index}.refused"
         if not file.exists() and not refused.exists():
             try:
-                arrays = _rendered(job, index)
+                arrays = _render_arrays(job, index)
             except UserError as error:
                 refused.write_text(str(error))
                 continue
@@ -110,19 +111,19 @@ def _render(job: str, count: int, folder: Path) -> Iterator[Path]:
             yield file
 
 
-def _rendered(job: str, index: int) -> dict[str, Any]:
+def _render_arrays(job: str, index: int) -> dict[str, Any]:
     """Pictures, masks and truth of both cameras, and their calibration."""
     baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
     keys = [f"render.stereo_mm={baseline_mm}", "store.extra=[shadow]", f"sequences={index + 1}"]
     scene = simulate(reader.load_job(job, keys), index)
     shots = list(scene.frames())
-    found = {name: np.stack([getattr(shot, name) for shot in shots]) for name in _STORED}
-    found |= {name: found[name].astype(np.float16) for name in ("flow", "motion")}
-    found["shadow"] = np.rint(255 * np.clip(found["shadow"], 0, 1)).astype(np.uint8)
+    arrays = {name: np.stack([getattr(shot, name) for shot in shots]) for name in _STORED}
+    arrays |= {name: arrays[name].astype(np.float16) for name in ("flow", "motion")}
+    arrays["shadow"] = np.rint(255 * np.clip(arrays["shadow"], 0, 1)).astype(np.uint8)
     size = np.linalg.norm(np.stack([shot.traction for shot in shots]), axis=-1)
     pressed = size > 0.05 * np.maximum(size.max((1, 2), keepdims=True), 1e-6)
     left, right = scene.view, scene.renderer.right
     assert right is not None
     lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
-    more = {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
-    return found | lenses | more | {"generator": provenance.fingerprint()}
+    others = {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+    return arrays | lenses | others | {"generator": provenance.fingerprint()}

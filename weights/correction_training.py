@@ -18,7 +18,17 @@ import torch
 from torch import Tensor
 
 from evidence.flow import scenes
-from evidence.flow.scenes import Field, dilated, inside, inverse, jpeg, noise_field, pixels, resampled, sensed
+from evidence.flow.scenes import (
+    Field,
+    add_noise,
+    dilate,
+    inside,
+    inverse,
+    jpeg,
+    noise_field,
+    pixels,
+    resample,
+)
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import correction, image
@@ -26,7 +36,7 @@ from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import depth_correction
 from synth.flow.stereo.depth_motion import Change
 from synth.flow.stereo.rig import Intrinsics, StereoRig
-from synth.flow.stereo.stereo_track import Moved, StereoTracker, still_frames
+from synth.flow.stereo.stereo_track import Motion3D, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
 from weights.networks import CorrectionNet, follow
@@ -50,29 +60,31 @@ def train(
     """
     examples.mkdir(parents=True, exist_ok=True)
     describe, repeats = (depth_example, 1) if depth else (example, 3)  # a drawn pair is a single frame
-    made: dict[str, Any] = {}
+    makers: dict[str, Any] = {}
     for file in sequences:
-        for again in range(2):
-            made[f"{file.stem}_{again}"] = lambda file=file, again=again: _varied(
-                dict(np.load(file)), np.random.default_rng([*file.stem.encode(), again]), again, depth
+        for variant in range(2):
+            makers[f"{file.stem}_{variant}"] = lambda file=file, variant=variant: _vary(
+                dict(np.load(file)), np.random.default_rng([*file.stem.encode(), variant]), variant, depth
             )
-    rendered = set(made)
-    made |= {f"g{i:04d}": lambda i=i: (_drawn_depth if depth else _drawn)(i) for i in range(drawn)}
-    made |= {f"p{i:04d}": lambda i=i: _warped(i) for i in range(0 if depth else drawn // 4)}
-    found, frames = [], 0
-    for name, make in made.items():
+    rendered = set(makers)
+    makers |= {
+        f"g{i:04d}": lambda i=i: (_make_drawn_depth if depth else _make_drawn_pair)(i) for i in range(drawn)
+    }
+    makers |= {f"p{i:04d}": lambda i=i: _make_warped_pair(i) for i in range(0 if depth else drawn // 4)}
+    dataset, frames = [], 0
+    for name, make in makers.items():
         file = examples / f"{name}.npz"
         if not file.exists():
             np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
             (examples / "part.npz").rename(file)
-        one = dict(np.load(file))
-        found += (1 if name in rendered else repeats) * [one]
-        frames += len(one["x"])
-    net, steps = fit(found, depth, minutes, seed)
-    return net, {"examples": len(made), "frames": frames, "steps": steps}
+        arrays = dict(np.load(file))
+        dataset += (1 if name in rendered else repeats) * [arrays]
+        frames += len(arrays["x"])
+    net, steps = fit(dataset, depth, minutes, seed)
+    return net, {"examples": len(makers), "frames": frames, "steps": steps}
 
 
-def _warped(index: int) -> Frames:
+def _make_warped_pair(index: int) -> Frames:
     """A pair with a pull under a tool, on drawn cortex."""
     rng = np.random.default_rng([77, index])
     size = int(rng.choice([192, 224]))
@@ -87,7 +99,7 @@ def _warped(index: int) -> Frames:
     return _pair([pair.rest, pair.now], hidden, pair.flow, pair.inside, pair.hidden, pair.inside)
 
 
-def _drawn(index: int) -> Frames:
+def _make_drawn_pair(index: int) -> Frames:
     """A pair of noise, ellipses, cortex or a photograph, perhaps with a bar as instrument, moving or still.
 
     Without these pairs the correction made flow worse on photographs, where it needs no correction.
@@ -96,7 +108,7 @@ def _drawn(index: int) -> Frames:
     size = int(rng.choice([160, 192, 224]))
     texture, flow = draw_texture(2 * size, rng), draw_motion(size, rng)
     noise, quality = rng.choice([0.3, 1, 2, 4]), int(rng.choice([0, 0, 0, 92, 75]))
-    before, after = (resampled(texture, places) for places in (pixels(size, size), inverse(flow)))
+    before, after = (resample(texture, places) for places in (pixels(size, size), inverse(flow)))
     if rng.random() < 0.4:
         ramp = np.linspace(-1, 1, size, dtype=np.float32)[:, None]
         after = after * (1 + rng.uniform(-0.1, 0.1) * ramp + rng.uniform(-0.08, 0.08))
@@ -106,38 +118,43 @@ def _drawn(index: int) -> Frames:
         end = tip + 2 * size * np.array([np.cos(angle), np.sin(angle)])
         cv2.line(bar, tip.astype(int).tolist(), end.astype(int).tolist(), 1, int(rng.uniform(4, 20)))
         after = np.where(bar[..., None] > 0, rng.uniform(40, 200), after)
-    rgb = [jpeg(sensed(one, noise, rng), quality) for one in (before, after)]
-    hidden, there = np.stack([np.zeros_like(bar, bool), dilated(bar > 0, 3)]), inside(flow)
-    covered = scenes.at_rest(hidden[1], flow) > 0.5
-    return _pair(rgb, hidden, flow, there, covered, there if rng.random() < 0.5 else np.ones_like(there))
+    rgb = [jpeg(add_noise(picture, noise, rng), quality) for picture in (before, after)]
+    hidden, in_view = np.stack([np.zeros_like(bar, bool), dilate(bar > 0, 3)]), inside(flow)
+    covered = scenes.warp_to_rest(hidden[1], flow) > 0.5
+    tissue = in_view if rng.random() < 0.5 else np.ones_like(in_view)
+    return _pair(rgb, hidden, flow, in_view, covered, tissue)
 
 
-def _drawn_depth(index: int) -> Frames:
+def _make_drawn_depth(index: int) -> Frames:
     """Stereo pairs of drawn textures on a slope, with lateral motion and independent motion in depth."""
     rng = np.random.default_rng([8642, index])
     size = int(rng.choice([160, 192, 224]))
     texture, flow = draw_texture(2 * size, rng), draw_motion(size, rng)
-    away, baseline, wide = rng.uniform(150, 400), rng.uniform(8, 40), np.exp(rng.uniform(2.3, 4.1))
-    focal, at = size * away / wide, pixels(size, size) - size / 2
-    rest = away * (1 + (at @ rng.normal(0, 0.2, 2)) / focal)
-    own = noise_field((size, size), float(rng.uniform(0.1, 1) * size), rng)
+    distance, baseline, width_mm = rng.uniform(150, 400), rng.uniform(8, 40), np.exp(rng.uniform(2.3, 4.1))
+    focal, offsets = size * distance / width_mm, pixels(size, size) - size / 2
+    rest = distance * (1 + (offsets @ rng.normal(0, 0.2, 2)) / focal)
+    relief = noise_field((size, size), float(rng.uniform(0.1, 1) * size), rng)
     length = np.linalg.norm(flow, axis=-1)
-    depth = own * rng.uniform(0, 0.7) * (rng.random() < 0.7) + length * away / focal * rng.uniform(-1, 1)
-    middle = focal * baseline / away
-    aside, moved = (focal * baseline / z - middle for z in (rest, rest + depth))
-    images, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(aside)
+    depth = relief * rng.uniform(0, 0.7) * (rng.random() < 0.7)
+    depth = depth + length * distance / focal * rng.uniform(-1, 1)
+    middle = focal * baseline / distance
+    rest_disparity, disparity = (focal * baseline / z - middle for z in (rest, rest + depth))
+    images, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(rest_disparity)
     for name, side in zip(_RGB, (0, 1), strict=True):
-        shifts = -side * np.stack([aside, nothing], -1), flow - side * np.stack([moved, nothing], -1)
-        shown = np.stack([resampled(texture, inverse(shift)) for shift in shifts])
-        images[name] = sensed(shown, noise, rng)
+        shifts = (
+            -side * np.stack([rest_disparity, nothing], -1),
+            flow - side * np.stack([disparity, nothing], -1),
+        )
+        pictures = np.stack([resample(texture, inverse(shift)) for shift in shifts])
+        images[name] = add_noise(pictures, noise, rng)
     K, other = (np.array([[focal, 0, size / 2 + c], [0, focal, size / 2], [0, 0, 1]]) for c in (0, middle))
-    free = np.zeros((2, size, size), bool)
+    unblocked = np.zeros((2, size, size), bool)
     return images | {
-        "tool": free,
-        "tool_right": free,
+        "tool": unblocked,
+        "tool_right": unblocked,
         "tissue": np.ones((size, size), bool),
         "visible": np.stack(2 * [inside(flow)]),
-        "pressed": free,
+        "pressed": unblocked,
         "motion": np.stack([np.zeros_like(depth), depth])[..., None] * [0, 0, 1],
         "K": K,
         "Kr": other,
@@ -147,15 +164,15 @@ def _drawn_depth(index: int) -> Frames:
     }
 
 
-def _pair(rgb: list[Any], hidden: Any, flow: Any, there: Any, covered: Any, tissue: Any) -> Frames:
+def _pair(rgb: list[Any], hidden: Any, flow: Any, in_view: Any, covered: Any, tissue: Any) -> Frames:
     length = np.linalg.norm(flow, axis=-1)
-    pressed = (length > 0.7 * max(float(length.max()), 1e-6)) & there
+    pressed = (length > 0.7 * max(float(length.max()), 1e-6)) & in_view
     return {
         "rgb": np.stack(rgb),
         "hidden": hidden,
         "tissue": tissue,
         "flow": np.stack([np.zeros_like(flow), flow]),
-        "visible": np.stack([there, there & ~covered]),
+        "visible": np.stack([in_view, in_view & ~covered]),
         "pressed": np.stack([pressed, pressed]),
     }
 
@@ -166,10 +183,10 @@ def draw_texture(size: int, rng: np.random.Generator) -> Any:
         periods = np.exp(rng.uniform(np.log(4), np.log(60), rng.integers(1, 4)))
         grey = sum(rng.uniform(0.2, 1) * noise_field(square, float(period), rng) for period in periods)
         tint = rng.uniform(10, 45) * rng.uniform(0.3, 1.3, 3)
-        own = [noise_field(square, float(rng.uniform(6, 60)), rng) for _ in range(3)]
+        channels = [noise_field(square, float(rng.uniform(6, 60)), rng) for _ in range(3)]
         spread = rng.uniform(2, 20) if rng.random() < 0.5 else 0
         return np.float32(
-            rng.uniform(60, 180, 3) + np.asarray(grey)[..., None] * tint + spread * np.stack(own, -1)
+            rng.uniform(60, 180, 3) + np.asarray(grey)[..., None] * tint + spread * np.stack(channels, -1)
         )
     if kind == 1:
         leaves = np.zeros((*square, 3), np.float32) + np.float32(rng.uniform(40, 200, 3))
@@ -183,11 +200,11 @@ def draw_texture(size: int, rng: np.random.Generator) -> Any:
     if kind == 2:
         return 255 * scenes.cortex(size, rng)
     photographs, tint = scenes.photographs_of("tuning", 384), np.eye(3) + rng.normal(0, 0.25, (3, 3))
-    one = photographs[int(rng.integers(len(photographs)))]
-    part = int(rng.integers(192, 385))
-    top, left = rng.integers(0, 385 - part, 2)
-    wide = cv2.resize(one[top : top + part, left : left + part], square, interpolation=cv2.INTER_CUBIC)
-    return np.float32(np.clip(wide @ tint.T * rng.uniform(0.5, 1.2), 0, 255))
+    photograph = photographs[int(rng.integers(len(photographs)))]
+    side = int(rng.integers(192, 385))
+    top, left = rng.integers(0, 385 - side, 2)
+    crop = cv2.resize(photograph[top : top + side, left : left + side], square, interpolation=cv2.INTER_CUBIC)
+    return np.float32(np.clip(crop @ tint.T * rng.uniform(0.5, 1.2), 0, 255))
 
 
 def draw_motion(size: int, rng: np.random.Generator) -> Any:
@@ -210,14 +227,14 @@ def example(frames: Frames) -> Frames:
     hidden = frames["hidden"] if "hidden" in frames else with_highlights(rgb, frames["tool"])
     tracker = Tracker(Tvl1(corrected=False), rgb[0], hidden[0], tissue)
     rows = []
-    rest = _normalised(rgb[0], tracker.usable)
+    rest = _normalise(rgb[0], tracker.usable)
     for t in range(1, len(rgb)):
         tracker.step(rgb[t], hidden[t])
         assert tracker.last is not None
-        flow, agreed = tracker.last.flow, tracker.last.confidence
-        now, along = _normalised(rgb[t], ~hidden[t]), np.ascontiguousarray(np.moveaxis(flow, -1, 0))
-        warped, usable = image.warp(now, image.flags(~hidden[t]), along)
-        x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), usable, flow, agreed)
+        flow, confidence = tracker.last.flow, tracker.last.confidence
+        normalised, along = _normalise(rgb[t], ~hidden[t]), np.ascontiguousarray(np.moveaxis(flow, -1, 0))
+        warped, usable = image.warp(normalised, image.flags(~hidden[t]), along)
+        x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), usable, flow, confidence)
         missing = ((frames["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
         share = correction.means(1.0 * tissue)
         y = correction.means(*missing) / np.maximum(share, 0.05)
@@ -232,41 +249,43 @@ def _weight(share: Any, visible: Any, pressed: Any) -> Any:
 
 
 def _example(rows: list[Any]) -> Frames:
-    padded = [[correction.padded(np.asarray(one, np.float32)) for one in row] for row in rows]
+    padded = [[correction.pad_cells(np.asarray(array, np.float32)) for array in row] for row in rows]
     return {name: np.stack(column) for name, column in zip("xyw", zip(*padded, strict=True), strict=True)}
 
 
 class _Observed(StereoTracker):
     """Tracker that stores the network's features and the uncorrected depth motion (H, W) mm of a frame."""
 
-    def _moved(self, change: Change, flow: Any, confidence: Any, lost: bool) -> Moved:
+    def _measure_motion(self, change: Change, flow: Any, confidence: Any, is_lost: bool) -> Motion3D:
         r = self.rectified
         self.features, _ = self.describe(change, flow, confidence)
         self.depth = r.depth(self.rest.disparity + change.px) - r.depth(self.rest.disparity)
-        return Moved.nothing(self.tissue.shape)
+        return Motion3D.zeros(self.tissue.shape)
 
 
 def depth_example(frames: Frames) -> Frames:
     """As `example`, for the depth solver: y in units of `depth_correction`."""
     tissue = frames["tissue"]
     hidden = [with_highlights(frames[rgb], frames[tool]) for rgb, tool in zip(_RGB, _TOOLS, strict=True)]
-    found = track(Tvl1(), frames["rgb"], hidden[0], tissue)
+    flow_track = track(Tvl1(), frames["rgb"], hidden[0], tissue)
     cameras = Intrinsics(frames["K"], frames["dist"]), Intrinsics(frames["Kr"], frames["distr"])
     pair = StereoRig(*cameras, np.eye(3), np.array([-float(frames["baseline"]), 0, 0]), tissue.shape[::-1])
-    still = still_frames(found.flow, tissue)
+    still_count = still_frames(flow_track.flow, tissue)
     left, right = (frames[rgb] for rgb in _RGB)
     try:
-        tracker = _Observed(pair, left[:still], right[:still], hidden[0][0], hidden[1][0], tissue)
+        tracker = _Observed(pair, left[:still_count], right[:still_count], hidden[0][0], hidden[1][0], tissue)
     except UserError:  # too blurred or noisy to match left and right: an example without weight
         return _example([[np.zeros((n, 30, 40), np.float32) for n in (depth_correction.CHANNELS, 1, 1)]])
-    rows, r, coarse = [], tracker.rectified, tracker.solver.coarse
+    rows, r, coarse = [], tracker.rectified, tracker.solver.average_cells
     inside = r.flags(tissue, 0).astype(np.float32)
     for t in range(1, len(frames["rgb"])):
-        tracker.step(left[t], right[t], hidden[0][t], hidden[1][t], found.flow[t], found.confidence[t])
-        there = frames["visible"][t] & tissue
+        tracker.step(
+            left[t], right[t], hidden[0][t], hidden[1][t], flow_track.flow[t], flow_track.confidence[t]
+        )
+        visible_tissue = frames["visible"][t] & tissue
         true, visible, pressed = (
-            r.picture(np.ascontiguousarray(one, np.float32), 0)
-            for one in (frames["motion"][t][..., 2], there, there & frames["pressed"][t])
+            r.picture(np.ascontiguousarray(plane, np.float32), 0)
+            for plane in (frames["motion"][t][..., 2], visible_tissue, visible_tissue & frames["pressed"][t])
         )
         share = coarse(inside)
         missing = coarse((true - tracker.depth) * inside) / np.maximum(share, 0.05) / depth_correction.UNIT_MM
@@ -276,50 +295,50 @@ def depth_example(frames: Frames) -> Frames:
     return _example(rows)
 
 
-def _normalised(rgb: Pixels, usable: Mask) -> Map:
+def _normalise(rgb: Pixels, usable: Mask) -> Map:
     return image.normalise(image.luminance(rgb), image.flags(usable))
 
 
-def _varied(frames: Frames, rng: np.random.Generator, again: int, depth: bool) -> Frames:
-    """The frames as from another camera if `again`; those of the right camera too if for depth."""
-    if not again:
+def _vary(frames: Frames, rng: np.random.Generator, variant: int, depth: bool) -> Frames:
+    """The frames as from another camera if `variant`; those of the right camera too if for depth."""
+    if not variant:
         return frames
     if not depth and rng.random() < 0.5:
-        frames = _resized(frames, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35)))))
+        frames = _resize(frames, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35)))))
     gain, gamma, white = rng.uniform(0.6, 1.3), np.exp(rng.normal(0, 0.15)), np.exp(rng.normal(0, 0.08, 3))
     contrast = rng.uniform(0.5, 1.1) if rng.random() < 0.4 else 1.0
     noise, blur, drift = rng.choice([0, 1, 2, 4]), rng.choice([0, 0, 0.5, 0.9]), rng.normal(0, 0.05)
     quality = int(rng.choice([0, 95, 85, 70, 50]))
-    shown: dict[str, list[Any]] = {name: [] for name in (_RGB if depth else _RGB[:1])}
-    for name in shown:
+    pictures_by_name: dict[str, list[Any]] = {name: [] for name in (_RGB if depth else _RGB[:1])}
+    for name in pictures_by_name:
         balance = white * np.exp(rng.normal(0, 0.03, 3))
         for t, picture in enumerate(frames[name]):
-            one = picture / 255.0
-            one = cv2.GaussianBlur(one, (0, 0), float(blur)) if blur else one
-            one = np.clip(one.mean((0, 1)) + contrast * (one - one.mean((0, 1))), 0, 1)
-            one = 255 * np.clip(gain * (1 + drift * t / 7) * balance * one**gamma, 0, 1)
-            final = jpeg(sensed(one, noise, rng), quality)
-            corrupt = not depth and t and rng.random() < _CORRUPTED
-            shown[name].append(_corrupted(final, rng) if corrupt else final)
-    return frames | {name: np.stack(pictures) for name, pictures in shown.items()}
+            level = picture / 255.0
+            level = cv2.GaussianBlur(level, (0, 0), float(blur)) if blur else level
+            level = np.clip(level.mean((0, 1)) + contrast * (level - level.mean((0, 1))), 0, 1)
+            level = 255 * np.clip(gain * (1 + drift * t / 7) * balance * level**gamma, 0, 1)
+            encoded = jpeg(add_noise(level, noise, rng), quality)
+            is_corrupt = not depth and t and rng.random() < _CORRUPTED
+            pictures_by_name[name].append(_corrupt(encoded, rng) if is_corrupt else encoded)
+    return frames | {name: np.stack(pictures) for name, pictures in pictures_by_name.items()}
 
 
-def _resized(frames: Frames, share: float) -> Frames:
-    old = np.array(frames["tissue"].shape[::-1])
-    size = [round(edge * share / 4) * 4 for edge in old.tolist()]
+def _resize(frames: Frames, share: float) -> Frames:
+    old_size = np.array(frames["tissue"].shape[::-1])
+    size = [round(edge * share / 4) * 4 for edge in old_size.tolist()]
 
-    def resize(stack: Any, how: int) -> Any:
-        return np.stack([cv2.resize(one, size, interpolation=how) for one in stack])
+    def resize(stack: Any, interpolation: int) -> Any:
+        return np.stack([cv2.resize(picture, size, interpolation=interpolation) for picture in stack])
 
     masks = {name: a for name, a in frames.items() if a.dtype == bool and a.ndim > 2}
     small = {name: resize(a.astype(np.uint8), cv2.INTER_NEAREST) > 0 for name, a in masks.items()}
     tissue = resize(frames["tissue"][None].astype(np.uint8), cv2.INTER_NEAREST)[0] > 0
-    flow = resize(frames["flow"].astype(np.float32), cv2.INTER_LINEAR) * np.float32(size / old)
+    flow = resize(frames["flow"].astype(np.float32), cv2.INTER_LINEAR) * np.float32(size / old_size)
     rgb = resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC)
     return small | {"tissue": tissue, "flow": flow, "rgb": rgb}
 
 
-def _corrupted(picture: Pixels, rng: np.random.Generator) -> Pixels:
+def _corrupt(picture: Pixels, rng: np.random.Generator) -> Pixels:
     """The image dark, out of focus, shifted or rotated: untrackable, so that the variance must be large."""
     ways = (
         lambda: (picture * 0.02).astype(np.uint8),
@@ -338,18 +357,18 @@ def fit(examples: list[Frames], depth: bool, minutes: float, seed: int) -> tuple
     _standardise(net, examples, kind.VECTORS)
     average, optimiser = copy.deepcopy(net), torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     groups: dict[tuple[int, ...], list[tuple[int, int]]] = {}
-    for i, one in enumerate(examples):
-        groups.setdefault(one["x"].shape[-2:], []).extend((i, t) for t in range(len(one["x"])))
+    for i, entry in enumerate(examples):
+        groups.setdefault(entry["x"].shape[-2:], []).extend((i, t) for t in range(len(entry["x"])))
     chances = np.array([len(group) for group in groups.values()], float)
-    began, steps = time.process_time(), 0
-    while (share := (time.process_time() - began) / (60 * minutes)) < 1:
+    start, steps = time.process_time(), 0
+    while (share := (time.process_time() - start) / (60 * minutes)) < 1:
         rate = _RATE * min(1, steps / 200) * (0.5 * (1 + np.cos(np.pi * share)) + 0.005)
         optimiser.param_groups[0]["lr"] = rate
         group = list(groups.values())[rng.choice(len(groups), p=chances / chances.sum())]
-        drawn = [group[k] for k in rng.integers(len(group), size=_BATCH)]
-        x, y, w = (torch.from_numpy(np.stack([examples[i][n][t] for i, t in drawn])).float() for n in "xyw")
+        batch = [group[k] for k in rng.integers(len(group), size=_BATCH)]
+        x, y, w = (torch.from_numpy(np.stack([examples[i][n][t] for i, t in batch])).float() for n in "xyw")
         # Depth depends on the direction of the baseline: its features aren't rotated.
-        x, y, w = _turned(x, y, w, int(rng.integers(4 if depth else 8)), kind.VECTORS)
+        x, y, w = _rotate(x, y, w, int(rng.integers(4 if depth else 8)), kind.VECTORS)
         optimiser.zero_grad()
         _loss(net(x), y, w).backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -361,16 +380,16 @@ def fit(examples: list[Frames], depth: bool, minutes: float, seed: int) -> tuple
 
 def _standardise(net: CorrectionNet, examples: list[Frames], vectors: Pairs) -> None:
     """Scales channels to mean 0 and deviation 1; vectors retain their direction."""
-    some = np.concatenate(
-        [np.moveaxis(one["x"], 1, -1).reshape(-1, one["x"].shape[1])[::60] for one in examples]
+    samples = np.concatenate(
+        [np.moveaxis(entry["x"], 1, -1).reshape(-1, entry["x"].shape[1])[::60] for entry in examples]
     )
-    mean, deviation = some.mean(0, dtype=np.float64), some.std(0, dtype=np.float64)
+    mean, deviation = samples.mean(0, dtype=np.float64), samples.std(0, dtype=np.float64)
     for pair in map(list, vectors):
         mean[pair], deviation[pair] = 0, deviation[pair].mean()
     net.mean[0, :, 0, 0], net.deviation[0, :, 0, 0] = torch.from_numpy(mean), torch.from_numpy(deviation)
 
 
-def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple[Tensor, Tensor, Tensor]:
+def _rotate(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple[Tensor, Tensor, Tensor]:
     """One of the eight rotations and reflections; y is a vector field if it has two channels."""
     for bit, side, axis in ((1, -1, 0), (2, -2, 1)):
         if turn & bit:
@@ -386,16 +405,16 @@ def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple
     return x, y, w
 
 
-def _loss(found: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
+def _loss(output: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
     """Mean over the examples, whose errors count in proportion to what each misses.
 
     Errors in px would be lowered most where much is missing, and motion that is recovered well made worse.
     """
-    added, log_variance = found.chunk(2, 1)
-    error, log_variance = missing - added, log_variance.clamp(-8, 5)
+    predicted, log_variance = output.chunk(2, 1)
+    error, log_variance = missing - predicted, log_variance.clamp(-8, 5)
     surprise = torch.log1p(error**2 / (_FREEDOM * torch.exp(log_variance)))
-    likely = 0.5 * log_variance + 0.5 * (_FREEDOM + 1) * surprise
+    nll = 0.5 * log_variance + 0.5 * (_FREEDOM + 1) * surprise
     total = weight.sum((1, 2, 3), keepdim=True) * missing.shape[1] + 1e-6
     typical = (weight * missing.abs()).sum((1, 2, 3), keepdim=True) / total + _LEAST
-    loss = weight * (likely + _PLAIN * torch.sqrt(error**2 + (0.1 * typical) ** 2) / typical)
+    loss = weight * (nll + _PLAIN * torch.sqrt(error**2 + (0.1 * typical) ** 2) / typical)
     return (loss.sum((1, 2, 3), keepdim=True) / total).mean()

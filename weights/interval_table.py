@@ -118,8 +118,8 @@ def intervals(
     """Calibrates the interval of the force and writes its table into the package."""
     if not only_fit:
         for folder, make, stated in _recordings(work, foreign, count, makes.split(",")):
-            for much, cameras in product((True, False), (2, 1)):
-                _score(work, folder, make, stated if much else None, cameras)
+            for is_full, cameras in product((True, False), (2, 1)):
+                _score(work, folder, make, stated if is_full else None, cameras)
     table = fit_table(read_examples(work / "scores"))
     text = json.dumps(asdict(table), indent=1, allow_nan=False)
     write_whole(force_interval.TABLE, text + "\n", durable=False)
@@ -128,10 +128,10 @@ def intervals(
 
 
 def _merge(tree: Tree, other: Mapping[str, Any]) -> Tree:
-    both = dict(tree)
+    merged = dict(tree)
     for key, value in other.items():
-        both[key] = _merge(both[key], value) if isinstance(both.get(key), dict) else value
-    return both
+        merged[key] = _merge(merged[key], value) if isinstance(merged.get(key), dict) else value
+    return merged
 
 
 def _recordings(
@@ -141,15 +141,15 @@ def _recordings(
     for number, make in enumerate(MAKES):
         if make not in makes:
             continue
-        data, (named, change) = work / "data" / make, MAKES[make]
-        tree = reader.load_job(named).model_dump(mode="json", exclude_unset=True)
+        data, (job_name, change) = work / "data" / make, MAKES[make]
+        tree = reader.load_job(job_name).model_dump(mode="json", exclude_unset=True)
         tree = _merge(_merge(_merge(tree, _VIDEO), change), {"sequences": count, "seed": _SEED + number})
         render_job(Job.model_validate(tree), data, workers=1)
         for sequence in Dataset(data):
             folder = work / "recordings" / make / f"{sequence.index:03d}"
             if not folder.exists():
                 export_recording(sequence, folder)
-            yield folder, make, _stated(sequence)
+            yield folder, make, _list_statements(sequence)
     for file in sorted([] if foreign is None else foreign.glob("**/truth.npz")):
         kind = file.parent.name.split("-")[0]
         membrane = "intact" if kind == "membrane" else "stripped"
@@ -160,7 +160,7 @@ def _recordings(
         )
 
 
-def _stated(sequence: Stored) -> Tree:
+def _list_statements(sequence: Stored) -> Tree:
     """Keys of meta.yaml for what an experimenter could state of a sequence."""
     covered = sequence.attrs["scenario"]["tissue"].get("membrane")
     size = np.linalg.norm(np.asarray(sequence["force"][:], np.float64), axis=1)
@@ -172,8 +172,8 @@ def _stated(sequence: Stored) -> Tree:
 
 def _score(work: Path, source: Path, make: str, stated: Tree | None, cameras: int) -> None:
     """Scores a copy of a recording that states this, None: scale and E alone; kept in WORK/scores."""
-    much = "little" if stated is None else "much"
-    file = work / "scores" / f"{make}-{source.name}-{much}-{cameras}.npz"
+    label = "little" if stated is None else "much"
+    file = work / "scores" / f"{make}-{source.name}-{label}-{cameras}.npz"
     if file.exists():
         return
     folder = work / "copy"
@@ -232,16 +232,16 @@ def fit_table(examples: Sequence[Example]) -> IntervalTable:
     """The calibration on all examples, and what it reaches on each make without that make."""
     table = _fit(examples)
     crossed = {make: _fit([e for e in examples if e.make != make]) for make in table.makes}
-    rows = {id(one): _judge(one, crossed[one.make]) for one in examples}
+    rows = {id(example): _judge(example, crossed[example.make]) for example in examples}
 
-    def pool(some: Sequence[Example]) -> dict[str, float]:
-        return _pool(some, [rows[id(one)] for one in some])
+    def pool(subset: Sequence[Example]) -> dict[str, float]:
+        return _pool(subset, [rows[id(example)] for example in subset])
 
     reached = {}
-    for cameras, much in product((2, 1), (True, False)):
-        some = [e for e in examples if e.video.cameras == cameras and (e.video.stated > 0) is much]
-        if some:
-            reached[f"{cameras} cameras, {'much' if much else 'little'} stated"] = pool(some)
+    for cameras, is_stated in product((2, 1), (True, False)):
+        subset = [e for e in examples if e.video.cameras == cameras and (e.video.stated > 0) is is_stated]
+        if subset:
+            reached[f"{cameras} cameras, {'much' if is_stated else 'little'} stated"] = pool(subset)
     reached |= {make: pool([e for e in examples if e.make == make]) for make in table.makes}
     reached["all"] = pool(examples)
     return replace(table, stating=_find_gains(examples, rows), reached=reached)
@@ -250,11 +250,11 @@ def fit_table(examples: Sequence[Example]) -> IntervalTable:
 def _fit(examples: Sequence[Example]) -> IntervalTable:
     by_cameras = {}
     for cameras in (1, 2):
-        some = [one for one in examples if one.video.cameras == cameras]
-        if some:
-            by_cameras[cameras] = _fit_model(some)
-    makes = sorted({one.make for one in examples})
-    count = {make: len({one.recording for one in examples if one.make == make}) for make in makes}
+        subset = [example for example in examples if example.video.cameras == cameras]
+        if subset:
+            by_cameras[cameras] = _fit_model(subset)
+    makes = sorted({example.make for example in examples})
+    count = {make: len({example.recording for example in examples if example.make == make}) for make in makes}
     return IntervalTable(
         features=tuple(force_interval.NAMES),
         by_cameras=by_cameras,
@@ -267,19 +267,19 @@ def _fit(examples: Sequence[Example]) -> IntervalTable:
 
 def _fit_model(examples: Sequence[Example]) -> CameraModel:
     """Error model and quantiles: makes weigh equally, so do a make's recordings, and a recording's frames."""
-    makes = sorted({one.make for one in examples})
-    recordings = {make: {one.recording for one in examples if one.make == make} for make in makes}
+    makes = sorted({example.make for example in examples})
+    recordings = {make: {example.recording for example in examples if example.make == make} for make in makes}
     weight = []
-    for one in examples:
-        same = sum(e.make == one.make and e.recording == one.recording for e in examples)
-        weight.append(1 / (len(makes) * len(recordings[one.make]) * same))
+    for example in examples:
+        count_same = sum(e.make == example.make and e.recording == example.recording for e in examples)
+        weight.append(1 / (len(makes) * len(recordings[example.make]) * count_same))
     parts = [np.full(len(e.error), w / len(e.error)) for e, w in zip(examples, weight, strict=True)]
     features, error = (np.concatenate([getattr(e, name) for e in examples]) for name in ("features", "error"))
     frames = np.concatenate(parts)
-    used = [k for k, name in enumerate(force_interval.NAMES) if name in _USED]
-    model = fit_error_model(features[:, used], np.abs(error), frames, _LEAST_ERROR, _RIDGE * len(error))
+    columns = [k for k, name in enumerate(force_interval.NAMES) if name in _USED]
+    model = fit_error_model(features[:, columns], np.abs(error), frames, _LEAST_ERROR, _RIDGE * len(error))
     slopes = np.zeros(features.shape[1])
-    slopes[used] = model.slopes
+    slopes[columns] = model.slopes
     lowest, highest = tuple(features.min(axis=0).tolist()), tuple(features.max(axis=0).tolist())
     model = ErrorModel(model.intercept, tuple(slopes.tolist()), lowest, highest, model.least)
     count = sum(map(len, recordings.values()))
@@ -292,24 +292,24 @@ def _fit_model(examples: Sequence[Example]) -> CameraModel:
     return CameraModel(model, below, above, count, len(examples))
 
 
-def _judge(one: Example, table: IntervalTable) -> dict[str, float]:
+def _judge(example: Example, table: IntervalTable) -> dict[str, float]:
     """Of one recording, over its largest true force: share that its interval holds, width, interval score
     (Gneiting and Raftery, JASA 102, 2007, eq. 43), error; and whether it has a number."""
-    low, high = (end[one.used] for end in table.bound(one.video, 0.0))
-    true, size = one.true_mn[one.used], one.video.size_mn[one.used]
+    low, high = (end[example.used] for end in table.bound(example.video, 0.0))
+    true, size = example.true_mn[example.used], example.video.size_mn[example.used]
     peak = float(true.max())
     return {
         "holds": float(((low <= true) & (true <= high)).mean()),
         "width": float((high - low).mean()) / peak,
         "score": float(_interval_score(low, high, true).mean()) / peak,
         "error": float(np.abs(size - true).mean()) / peak,
-        "reached": float(not table.find_gaps(one.video)),
+        "reached": float(not table.find_gaps(example.video)),
     }
 
 
 def _interval_score(low: Floats, high: Floats, true: Floats) -> Floats:
-    out = np.maximum(low - true, 0) + np.maximum(true - high, 0)
-    return np.asarray(high - low + 2 / (1 - force_interval.LEVEL) * out)
+    excess = np.maximum(low - true, 0) + np.maximum(true - high, 0)
+    return np.asarray(high - low + 2 / (1 - force_interval.LEVEL) * excess)
 
 
 def _pool(examples: Sequence[Example], rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -326,23 +326,27 @@ def _pool(examples: Sequence[Example], rows: Sequence[Mapping[str, float]]) -> d
 def _constant(examples: Sequence[Example], half: float) -> float:
     """Mean interval score with a half width of this share of the largest estimate everywhere."""
     scores = []
-    for one in examples:
-        size, true = one.video.size_mn[one.used], one.true_mn[one.used]
-        wide = half * one.video.largest_mn
-        scores.append(_interval_score(np.maximum(size - wide, 0), size + wide, true).mean() / true.max())
+    for example in examples:
+        size, true = example.video.size_mn[example.used], example.true_mn[example.used]
+        half_mn = half * example.video.largest_mn
+        score = _interval_score(np.maximum(size - half_mn, 0), size + half_mn, true)
+        scores.append(score.mean() / true.max())
     return float(np.mean(scores))
 
 
 def _find_gains(examples: Sequence[Example], rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
     """Mean width with a second camera, and with all that can be stated, over that without it."""
     widths: dict[tuple[str, str, int, bool], float] = {}
-    for one in examples:
-        widths[one.make, one.recording, one.video.cameras, one.video.stated > 0] = rows[id(one)]["width"]
+    for example in examples:
+        key = example.make, example.recording, example.video.cameras, example.video.stated > 0
+        widths[key] = rows[id(example)]["width"]
 
     def ratio(with_it: Mapping[Any, float], without: Mapping[Any, float]) -> float:
-        both = [np.log(width / without[key]) for key, width in with_it.items() if key in without]
-        return float(np.exp(np.mean(both))) if both else 1.0
+        log_ratios = [np.log(width / without[key]) for key, width in with_it.items() if key in without]
+        return float(np.exp(np.mean(log_ratios))) if log_ratios else 1.0
 
     cameras = [{(m, r, s): w for (m, r, c, s), w in widths.items() if c == n} for n in (2, 1)]
-    stated = [{(m, r, c): w for (m, r, c, s), w in widths.items() if s is much} for much in (True, False)]
+    stated = [
+        {(m, r, c): w for (m, r, c, s), w in widths.items() if s is is_stated} for is_stated in (True, False)
+    ]
     return {"second camera": ratio(*cameras), "statements": ratio(*stated)}

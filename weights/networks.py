@@ -31,7 +31,7 @@ class SegmentationNet(nn.Module):
         super().__init__()
         a, b, c, d = _SEGMENTATION
         self.stem = nn.Sequential(_layer(segmentation.CHANNELS * _BLOCK**2, a, 1), _layer(a, a))
-        self.down = nn.ModuleList([_halved(a, b), _halved(b, c), _halved(c, d)])
+        self.down = nn.ModuleList([_downsample(a, b), _downsample(b, c), _downsample(c, d)])
         self.whole = nn.Linear(d, d)
         self.up = nn.ModuleList([_join(d + c, c), _join(c + b, b), _join(b + a, a)])
         self.head = nn.Conv2d(a, len(segmentation.CLASSES) * _BLOCK**2, 1)
@@ -43,7 +43,7 @@ class SegmentationNet(nn.Module):
         field = skips.pop()
         field = field + self.whole(field.mean((2, 3)))[..., None, None]  # colours of the whole picture
         for layer in self.up:
-            field = layer(torch.cat([_doubled(field), skips.pop()], 1))
+            field = layer(torch.cat([_upsample(field), skips.pop()], 1))
         return F.pixel_shuffle(self.head(field), _BLOCK)
 
 
@@ -73,9 +73,9 @@ class CorrectionNet(nn.Module):
             skips.append(layer(skips[-1]))
         field = skips.pop()
         for layer in self.up:
-            field = layer(torch.cat([_doubled(field), skips.pop()], 1))
-        added, log_variance = self.head(field).split(self.parts, 1)
-        return torch.cat([added + self.straight(features), log_variance], 1)
+            field = layer(torch.cat([_upsample(field), skips.pop()], 1))
+        residual, log_variance = self.head(field).split(self.parts, 1)
+        return torch.cat([residual + self.straight(features), log_variance], 1)
 
 
 def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
@@ -93,7 +93,8 @@ def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
             do_constant_folding=False, training=torch.onnx.TrainingMode.PRESERVE,
         )  # fmt: skip
     model = onnx.load(file)
-    for weight in [one for one in model.graph.initializer if one.data_type == onnx.TensorProto.FLOAT]:
+    weights = [tensor for tensor in model.graph.initializer if tensor.data_type == onnx.TensorProto.FLOAT]
+    for weight in weights:
         values, name = onnx.numpy_helper.to_array(weight).astype(np.float16), weight.name
         weight.CopyFrom(onnx.numpy_helper.from_array(values, f"{name} half"))
         cast = onnx.helper.make_node("Cast", [f"{name} half"], [name], to=onnx.TensorProto.FLOAT)
@@ -143,7 +144,7 @@ class _Residual(nn.Module):
         return F.relu(field + self.second(self.first(field)))
 
 
-def _doubled(field: Tensor) -> Tensor:
+def _upsample(field: Tensor) -> Tensor:
     return F.interpolate(field, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
@@ -152,7 +153,7 @@ def _layer(inside: int, outside: int, size: int = 3, stride: int = 1) -> nn.Sequ
     return nn.Sequential(convolution, nn.BatchNorm2d(outside), nn.ReLU(inplace=True))
 
 
-def _halved(inside: int, outside: int) -> nn.Sequential:
+def _downsample(inside: int, outside: int) -> nn.Sequential:
     # A stride of 2 needs an even kernel: a kernel of 3 would shift the picture by half a pixel.
     return nn.Sequential(_layer(inside, outside, 4, 2), _Residual(outside))
 

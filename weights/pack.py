@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from evidence import report
-from evidence.learn.shipped import listed, measure
+from evidence.learn.shipped import list_figures, measure
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.inference import shipped_networks
@@ -28,8 +28,8 @@ def pack(models: Path, data: list[Path], cache: Path | None = None) -> None:
     """
     rows = measure(data, models, cache)["rows"]
     for name in shipped_networks.NAMES:
-        own = [row for row in rows if row["model"] == name]
-        pack_model(models / name, shipped_networks.MODELS / name, report.commit(), listed(own), _LIMITS)
+        figures = list_figures([row for row in rows if row["model"] == name])
+        pack_model(models / name, shipped_networks.MODELS / name, report.commit(), figures, _LIMITS)
 
 
 def pack_model(
@@ -53,8 +53,8 @@ def pack_model(
         "commit": commit,
     }
     rows |= metrics
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
-    bullets = "\n".join(f"- {one}" for one in limits)
+    table = "\n".join(f"| {label} | {value} |" for label, value in rows.items())
+    bullets = "\n".join(f"- {limit}" for limit in limits)
     head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
     write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
     size = max(file.stat().st_size for file in folder.iterdir())

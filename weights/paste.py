@@ -58,7 +58,7 @@ class Mirror:
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class Sprite:
     """An object to be drawn: its outline at any place, and its surface."""
 
     outlines: tuple[Outline, ...]  # kind, points (N, 2), width; in picture widths
@@ -73,108 +73,116 @@ class Thing:
     grain: Map | None = None  # (H, W) of mean 1: noise on it and on its shadows, as a path tracer leaves it
 
 
-def draw_instrument(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+def draw_instrument(rng: np.random.Generator, picture: Map, other: Map) -> Sprite:
     """A random rod, tube, forceps, bayonet, spatula, hook or probe that enters from outside."""
     tip, turn = rng.uniform(0.15, 0.85, 2) * [1, 0.75], rng.uniform(0, 2 * np.pi)
-    way = np.array([np.cos(turn), np.sin(turn)])
-    side = np.array([-way[1], way[0]])
-    wide, end = float(np.exp(rng.uniform(np.log(0.012), np.log(0.13)))), tip + 2.0 * way
+    direction = np.array([np.cos(turn), np.sin(turn)])
+    side = np.array([-direction[1], direction[0]])
+    thickness, end = float(np.exp(rng.uniform(np.log(0.012), np.log(0.13)))), tip + 2.0 * direction
     kind = str(rng.choice(["rod", "rod", "taper", "forceps", "forceps", "bent", "spatula", "jointed"]))
     if kind == "rod":
-        parts = [("line", np.stack([tip, end]), wide)]
+        parts = [("line", np.stack([tip, end]), thickness)]
     elif kind == "taper":
-        parts = [_taper(tip, way, wide, rng)]
+        parts = [_taper(tip, direction, thickness, rng)]
     elif kind == "forceps":
-        spread, tilt, wide = rng.uniform(0.0, 0.16), rng.uniform(0, 0.25), min(wide, 0.07)
+        spread, tilt, thickness = rng.uniform(0.0, 0.16), rng.uniform(0, 0.25), min(thickness, 0.07)
         parts = []
         for sign in (-1, 1):
-            arm = way * np.cos(sign * tilt) + side * np.sin(sign * tilt)
-            parts.append(_taper(tip + sign * spread / 2 * side, arm, wide, rng))
+            arm = direction * np.cos(sign * tilt) + side * np.sin(sign * tilt)
+            parts.append(_taper(tip + sign * spread / 2 * side, arm, thickness, rng))
     elif kind in ("bent", "jointed"):
-        knee = tip + rng.uniform(0.08, 0.4) * (way + rng.uniform(-1, 1) * side)
+        knee = tip + rng.uniform(0.08, 0.4) * (direction + rng.uniform(-1, 1) * side)
         t = np.linspace(0, 1, 24)[:, None]
-        curve = (1 - t) ** 2 * tip + 2 * t * (1 - t) * knee + t**2 * (knee + rng.uniform(0.1, 0.4) * way)
+        curve = (
+            (1 - t) ** 2 * tip + 2 * t * (1 - t) * knee + t**2 * (knee + rng.uniform(0.1, 0.4) * direction)
+        )
         line = np.stack([tip, knee]) if kind == "jointed" else curve
-        parts = [("line", line, wide), ("line", np.stack([line[-1], line[-1] + 2 * way]), wide)]
+        parts = [
+            ("line", line, thickness),
+            ("line", np.stack([line[-1], line[-1] + 2 * direction]), thickness),
+        ]
     else:
-        blade = np.array([tip + rng.uniform(0.05, 0.2) * way, tip])
-        parts = [("line", blade, wide * rng.uniform(1.2, 2.5)), ("line", np.stack([blade[0], end]), wide)]
-    thing = _finish(parts, rng, picture, other)
+        blade = np.array([tip + rng.uniform(0.05, 0.2) * direction, tip])
+        parts = [
+            ("line", blade, thickness * rng.uniform(1.2, 2.5)),
+            ("line", np.stack([blade[0], end]), thickness),
+        ]
+    sprite = _finish(parts, rng, picture, other)
     if rng.random() < 0.3:
-        thing = replace(thing, details=_details(tip, way, wide, rng))
+        sprite = replace(sprite, details=_details(tip, direction, thickness, rng))
     if rng.random() < _POLISHED:
         noise = 1 + rng.uniform(0, 0.3) * rng.standard_normal(picture.shape[:2], np.float32)
         grain = np.asarray(noise, np.float32) if rng.random() < 0.5 else None
-        thing = replace(thing, mirror=_polish(rng), grain=grain)
-    return thing
+        sprite = replace(sprite, mirror=_polish(rng), grain=grain)
+    return sprite
 
 
-def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Sprite:
     """A random finger, hand, patty, cloth or drop, which is no instrument."""
     middle, turn = rng.uniform(0, 1, 2) * [1, 0.75], rng.uniform(0, 2 * np.pi)
-    way = np.array([np.cos(turn), np.sin(turn)])
+    direction = np.array([np.cos(turn), np.sin(turn)])
     if rng.random() < 0.4:
-        parts = [("line", np.stack([middle, middle + 2 * way]), float(rng.uniform(_WIDE + 0.03, 0.35)))]
+        parts = [("line", np.stack([middle, middle + 2 * direction]), float(rng.uniform(_WIDE + 0.03, 0.35)))]
     else:
         angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
         size, waves = rng.uniform(0.04, 0.25), rng.normal(0, 0.12, (3, 2))
         radius = 1 + sum(a * np.cos((k + 2) * angle + b) for k, (a, b) in enumerate(waves))
         points = np.stack([radius * np.cos(angle), rng.uniform(0.4, 1) * radius * np.sin(angle)], 1)
-        parts = [("area", middle + size * points @ np.stack([way, [-way[1], way[0]]]), 0.0)]
+        parts = [("area", middle + size * points @ np.stack([direction, [-direction[1], direction[0]]]), 0.0)]
     return _finish(parts, rng, picture, other)
 
 
-def draw_marking(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+def draw_marking(rng: np.random.Generator, picture: Map, other: Map) -> Sprite:
     """A random line, grid or patch of the tissue that looks like an object but moves with the tissue."""
     kind = rng.choice(["line", "grid", "patch"])
-    thing = (
+    sprite = (
         draw_object(rng, picture, other) if kind == "patch" else _lines(kind == "grid", rng, picture, other)
     )
-    return replace(thing, shades=()) if rng.random() < 0.7 else thing
+    return replace(sprite, shades=()) if rng.random() < 0.7 else sprite
 
 
-def _lines(grid: bool, rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+def _lines(grid: bool, rng: np.random.Generator, picture: Map, other: Map) -> Sprite:
     """A random winding line across the picture, or many side by side and perhaps as many across them."""
-    turn, wide = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(np.log(0.006), np.log(0.08))))
-    way, side = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    turn, thickness = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(np.log(0.006), np.log(0.08))))
+    direction, side = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     middle = rng.uniform(0, 1, 2) * [1, 0.75]
     t = np.linspace(-1.5, 1.5, 40)[:, None] if rng.random() < 0.7 else np.linspace(-0.3, 0.2, 20)[:, None]
     bend = rng.normal(0, 0.06) * np.sin(rng.uniform(2, 12) * t + rng.uniform(0, 6))
-    gap = rng.uniform(2, 8) * wide
+    gap = rng.uniform(2, 8) * thickness
     steps = gap * np.arange(-min(15, 0.5 / gap), min(15, 0.5 / gap)) if grid else np.zeros(1)
-    parts = [("line", middle + t * way + (bend + step) * side, wide) for step in steps]
+    parts = [("line", middle + t * direction + (bend + step) * side, thickness) for step in steps]
     if grid and rng.random() < 0.5:
-        parts += [("line", middle + t * side + (bend + step) * way, wide) for step in steps]
+        parts += [("line", middle + t * side + (bend + step) * direction, thickness) for step in steps]
     return _finish(parts, rng, picture, other)
 
 
-def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:
+def paste(layer: Layer, sprite: Sprite, shift: Floats) -> Layer:
     """A layer with an object moved by `shift` (2,) picture widths, and its shadows."""
-    body = _cover(thing.outlines, shift, layer.instrument.shape)
+    body = _cover(sprite.outlines, shift, layer.instrument.shape)
     picture, shadow = layer.picture, layer.shadow
     width = body.shape[1]
-    grain = np.ones_like(body) if thing.grain is None else thing.grain
-    for offset, blur, strength in thing.shades:
-        shade = _cover(thing.outlines, shift + offset, body.shape)
+    grain = np.ones_like(body) if sprite.grain is None else sprite.grain
+    for offset, blur, strength in sprite.shades:
+        shade = _cover(sprite.outlines, shift + offset, body.shape)
         shade = strength * cv2.GaussianBlur(shade, (0, 0), max(0.3, blur * width))
         shade = np.clip(shade * grain, 0, 1)
         picture = picture * (1 - shade[..., None])
         shadow = np.maximum(shadow, shade)
     inner = _inner(body)
-    shade = 1 - thing.round * (1 - inner) ** 2
+    shade = 1 - sprite.round * (1 - inner) ** 2
     line = np.exp(-(((inner - 0.7) / 0.12) ** 2))
-    surface = thing.colour if thing.texture is None else thing.texture
-    surface = surface * shade[..., None] + thing.shine * line[..., None]
-    if thing.mirror is not None:
-        surface = _reflect(thing, shift, picture, inner)
-    for outline, brighter in thing.details:
+    surface = sprite.colour if sprite.texture is None else sprite.texture
+    surface = surface * shade[..., None] + sprite.shine * line[..., None]
+    if sprite.mirror is not None:
+        surface = _reflect(sprite, shift, picture, inner)
+    for outline, brighter in sprite.details:
         surface = surface * (1 + brighter * _cover((outline,), shift, body.shape)[..., None])
     surface = surface * grain[..., None]
-    soft = body if thing.soft_px < 0.3 else cv2.GaussianBlur(body, (0, 0), thing.soft_px)
+    soft = body if sprite.soft_px < 0.3 else cv2.GaussianBlur(body, (0, 0), sprite.soft_px)
     picture = picture * (1 - soft[..., None]) + surface * soft[..., None]
     free = 1 - body
-    found = np.maximum(layer.instrument * free, body)
-    return Layer(np.asarray(picture, np.float32), found, shadow * free, layer.highlight * free)
+    instrument = np.maximum(layer.instrument * free, body)
+    return Layer(np.asarray(picture, np.float32), instrument, shadow * free, layer.highlight * free)
 
 
 def add_highlights(layer: Layer, rng: np.random.Generator) -> Layer:
@@ -187,13 +195,13 @@ def add_highlights(layer: Layer, rng: np.random.Generator) -> Layer:
         strength = np.clip((wet - np.quantile(wet, 1 - share)) / edge + 0.5, 0, 1)
     else:  # single round ones
         across, centre = np.exp(rng.uniform(0.5, 2.3, (4, 1, 1))), rng.uniform(0, 1, (4, 2, 1, 1))
-        away = np.indices(shape) - centre * np.reshape(shape, (2, 1, 1))
-        strength = np.exp(-(away**2).sum(1) / (2 * across**2))[: rng.integers(1, 5)].max(0)
+        offset = np.indices(shape) - centre * np.reshape(shape, (2, 1, 1))
+        strength = np.exp(-(offset**2).sum(1) / (2 * across**2))[: rng.integers(1, 5)].max(0)
     strength = strength * (1 - layer.instrument)
     white = rng.uniform(225, 275) * (1 + rng.normal(0, 0.03, 3))
     lit = layer.picture + strength[..., None] * np.maximum(white - layer.picture, 0)
-    found = np.maximum(layer.highlight, np.clip(2 * strength, 0, 1))
-    return Layer(np.asarray(lit, np.float32), layer.instrument, layer.shadow, found)
+    highlight = np.maximum(layer.highlight, np.clip(2 * strength, 0, 1))
+    return Layer(np.asarray(lit, np.float32), layer.instrument, layer.shadow, highlight)
 
 
 def add_vessels(layer: Layer, rng: np.random.Generator) -> Layer:
@@ -206,16 +214,16 @@ def add_vessels(layer: Layer, rng: np.random.Generator) -> Layer:
     for _ in range(int(rng.integers(1, 4))):
         if rng.random() < 0.3:
             hue = _vessel_colour(rng)
-        wide = float(np.exp(rng.uniform(np.log(0.025), np.log(0.13))))
-        cover = _cover((_path(wide, rng),), np.zeros(2), shape)
+        thickness = float(np.exp(rng.uniform(np.log(0.025), np.log(0.13))))
+        cover = _cover((_path(thickness, rng),), np.zeros(2), shape)
         inner = _inner(cover)
         slope = _slopes(inner)
         mottle = 1 + rng.uniform(0, 0.12) * noise_field(shape, float(rng.uniform(5, 60)), rng)
         shade = (1 - lit * np.clip(slope @ light, -1, 1) - rng.uniform(0, 0.4) * (1 - inner) ** 2) * mottle
         # A crest is wet where it faces the lamp: a broken line along it.
-        off = ((slope - rng.uniform(0, 0.6) * light) ** 2).sum(-1) / rng.uniform(0.05, 0.4) ** 2
+        exponent = ((slope - rng.uniform(0, 0.6) * light) ** 2).sum(-1) / rng.uniform(0.05, 0.4) ** 2
         broken = np.clip(0.5 + rng.uniform(0, 2) * noise_field(shape, float(rng.uniform(8, 60)), rng), 0, 1)
-        wet = cover * broken * np.exp(-off) * rng.uniform(0, 1.2) * (rng.random() < 0.8)
+        wet = cover * broken * np.exp(-exponent) * rng.uniform(0, 1.2) * (rng.random() < 0.8)
         opaque = rng.uniform(0.6, 1) * cv2.GaussianBlur(cover, (0, 0), float(rng.uniform(0.5, 3)))
         picture = picture + opaque[..., None] * (hue * shade[..., None] - picture)
         picture = picture + np.clip(wet, 0, 1)[..., None] * np.maximum(245 - picture, 0)
@@ -232,13 +240,13 @@ def _vessel_colour(rng: np.random.Generator) -> Floats:
     return rng.uniform(20, 230, 3)
 
 
-def _path(wide: float, rng: np.random.Generator) -> Outline:
+def _path(thickness: float, rng: np.random.Generator) -> Outline:
     """A winding line across the picture; some end in it."""
     turn, t = rng.uniform(0, 2 * np.pi), np.linspace(-1.5 if rng.random() < 0.75 else 0.0, 1.5, 80)[:, None]
-    way = np.array([np.cos(turn), np.sin(turn)])
+    direction = np.array([np.cos(turn), np.sin(turn)])
     waves = [rng.normal(0, 0.07 / k) * np.sin(k * rng.uniform(2, 7) * t + rng.uniform(0, 6)) for k in (1, 2)]
     middle = rng.uniform(0, 1, 2) * [1, 0.75]
-    return "line", middle + t * way + sum(waves) * np.array([-way[1], way[0]]), wide
+    return "line", middle + t * direction + sum(waves) * np.array([-direction[1], direction[0]]), thickness
 
 
 def _polish(rng: np.random.Generator) -> Mirror:
@@ -250,8 +258,8 @@ def _polish(rng: np.random.Generator) -> Mirror:
     level = np.exp(rng.uniform(np.log(15), np.log(200)))
     around = level * np.clip(1 + rng.uniform(0, 0.7) * bands, 0, 3)
     for _ in range(int(rng.integers(0, 4))):  # lamps
-        off = ((slopes - rng.uniform(-0.7, 0.7, 2)) ** 2).sum(-1) / np.exp(rng.uniform(-3.3, -1.2)) ** 2
-        around = around + rng.uniform(60, 350) * np.exp(-off)[..., None]
+        exponent = ((slopes - rng.uniform(-0.7, 0.7, 2)) ** 2).sum(-1) / np.exp(rng.uniform(-3.3, -1.2)) ** 2
+        around = around + rng.uniform(60, 350) * np.exp(-exponent)[..., None]
     around = np.broadcast_to(around, (_SIDE, _SIDE, 3)) * (1 + rng.normal(0, 0.05, 3))
     edge, blend = rng.uniform(0.3, 1.0), rng.uniform(0.05, 0.5)
     near = np.exp(rng.uniform(np.log(0.01), np.log(0.5)))
@@ -260,47 +268,47 @@ def _polish(rng: np.random.Generator) -> Mirror:
     return Mirror(metal, surroundings, rng.uniform(0.2, 1), edge, blend, near, reach, rough)
 
 
-def _reflect(thing: Thing, shift: Floats, picture: Map, inner: Map) -> Map:
+def _reflect(sprite: Sprite, shift: Floats, picture: Map, inner: Map) -> Map:
     """What an object's surface (H, W, 3) mirrors in front of a picture."""
-    mirror, width = thing.mirror, inner.shape[1]
+    mirror, width = sprite.mirror, inner.shape[1]
     assert mirror is not None
     slope = _slopes(inner)
     columns, rows = (np.ascontiguousarray((part + 1) * (_SIDE // 2)) for part in np.moveaxis(slope, -1, 0))
     around = cv2.remap(mirror.surroundings, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # Just inside its rim a round body mirrors what is just outside, further in what is far away.
     steep = np.linalg.norm(slope, axis=-1)
-    far = width * mirror.reach * np.clip((1 - steep) / np.maximum(steep - 0.6, 0.15), 0, 2)
+    distance = width * mirror.reach * np.clip((1 - steep) / np.maximum(steep - 0.6, 0.15), 0, 2)
     y, x = np.indices(inner.shape, np.float32)
-    away = np.asarray(slope / np.maximum(steep, 1e-3)[..., None] * far[..., None], np.float32)
+    offset = np.asarray(slope / np.maximum(steep, 1e-3)[..., None] * distance[..., None], np.float32)
     smeared = cv2.GaussianBlur(picture, (0, 0), max(0.5, mirror.rough * width))
-    beside = cv2.remap(
-        smeared, x + away[..., 0], y + away[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    reflection = cv2.remap(
+        smeared, x + offset[..., 0], y + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
     )
-    points = thing.outlines[0][1]
+    points = sprite.outlines[0][1]
     tip = points[0] + shift
-    way = points[len(points) // 2] + shift - tip
-    way = way / max(float(np.linalg.norm(way)), 1e-6)
-    along = np.maximum(((np.stack([x, y], -1) / width - tip) @ way), 0) / mirror.near
+    direction = points[len(points) // 2] + shift - tip
+    direction = direction / max(float(np.linalg.norm(direction)), 1e-6)
+    along = np.maximum(((np.stack([x, y], -1) / width - tip) @ direction), 0) / mirror.near
     close = np.exp(-along)
     share = np.clip((steep - mirror.edge) / mirror.blend + close, 0, 1)[..., None]
     dim = (mirror.fade + (1 - mirror.fade) * np.exp(-0.2 * along))[..., None]
-    return np.asarray(mirror.metal * (share * beside + (1 - share) * dim * around), np.float32)
+    return np.asarray(mirror.metal * (share * reflection + (1 - share) * dim * around), np.float32)
 
 
 def _details(
-    tip: Floats, way: Floats, wide: float, rng: np.random.Generator
+    tip: Floats, direction: Floats, thickness: float, rng: np.random.Generator
 ) -> tuple[tuple[Outline, float], ...]:
     """Random rings, a sleeve or a screw on a shaft, and by what share each is brighter."""
-    side = np.array([-way[1], way[0]]) * wide
+    side = np.array([-direction[1], direction[0]]) * thickness
     kind, start, brighter = rng.integers(3), rng.uniform(0.02, 0.5), float(rng.uniform(-0.8, 0.8))
     if kind == 0:
-        middles = [tip + (start + wide * step) * way for step in _steps(rng)]
-        outlines = [("line", np.stack([middle - side, middle + side]), 0.2 * wide) for middle in middles]
+        middles = [tip + (start + thickness * step) * direction for step in _steps(rng)]
+        outlines = [("line", np.stack([middle - side, middle + side]), 0.2 * thickness) for middle in middles]
     elif kind == 1:
-        outlines = [("line", np.stack([tip + start * way, tip + 2 * way]), 1.3 * wide)]
+        outlines = [("line", np.stack([tip + start * direction, tip + 2 * direction]), 1.3 * thickness)]
     else:
-        screw = tip + start * way
-        outlines = [("line", np.stack([screw, screw]), wide * rng.uniform(0.3, 0.7))]
+        screw = tip + start * direction
+        outlines = [("line", np.stack([screw, screw]), thickness * rng.uniform(0.3, 0.7))]
     return tuple((outline, brighter) for outline in outlines)
 
 
@@ -321,20 +329,20 @@ def _inner(body: Map) -> Map:
 def _slopes(inner: Map) -> Map:
     """Slopes (H, W, 2) along x and y of a round body, 1 outwards at its rim."""
     smooth = cv2.GaussianBlur(inner, (0, 0), 1.0)
-    rise = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *way, ksize=3) for way in ((1, 0), (0, 1))], -1)
+    rise = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1))], -1)
     rise /= np.maximum(np.linalg.norm(rise, axis=-1, keepdims=True), 1e-6)
     return np.asarray(-rise * (1 - inner)[..., None], np.float32)
 
 
-def _taper(tip: Floats, way: Floats, wide: float, rng: np.random.Generator) -> Outline:
+def _taper(tip: Floats, direction: Floats, thickness: float, rng: np.random.Generator) -> Outline:
     """A body that widens from its tip, then is even."""
-    side, long = np.array([-way[1], way[0]]) * wide / 2, rng.uniform(0.05, 0.8)
-    sharp, neck, end = rng.uniform(0.1, 0.8), tip + long * way, tip + 2 * way
+    side, long = np.array([-direction[1], direction[0]]) * thickness / 2, rng.uniform(0.05, 0.8)
+    sharp, neck, end = rng.uniform(0.1, 0.8), tip + long * direction, tip + 2 * direction
     points = [tip - sharp * side, tip + sharp * side, neck + side, end + side, end - side, neck - side]
     return "area", np.array(points), 0.0
 
 
-def _finish(parts: list[Outline], rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+def _finish(parts: list[Outline], rng: np.random.Generator, picture: Map, other: Map) -> Sprite:
     """An object of an outline with a random surface, focus and shadows."""
     kind, texture = rng.random(), None
     colour = rng.uniform(25, 235) * (1 + rng.normal(0, 0.05, 3))
@@ -351,21 +359,21 @@ def _finish(parts: list[Outline], rng: np.random.Generator, picture: Map, other:
         texture = np.asarray(colour + rng.uniform(3, 30) * mottle, np.float32)
     shades = []
     for _ in range(int(rng.choice([0, 1, 1, 2]))):
-        away = rng.normal(0, 0.07, 2) * rng.choice([0.3, 1, 2])
-        shades.append((away, float(np.exp(rng.uniform(-6, -2.8))), float(rng.uniform(0.15, 0.8))))
+        offset = rng.normal(0, 0.07, 2) * rng.choice([0.3, 1, 2])
+        shades.append((offset, float(np.exp(rng.uniform(-6, -2.8))), float(rng.uniform(0.15, 0.8))))
     soft = float(rng.choice([0.4, 0.7, 1.2, 2.5], p=[0.4, 0.35, 0.15, 0.1]))
     shine = rng.uniform(-20, 140) * (rng.random() < 0.6)
     surface = np.asarray(colour), texture, rng.uniform(0, 0.7), shine
-    return Thing(tuple(parts), *surface, soft, tuple(shades))
+    return Sprite(tuple(parts), *surface, soft, tuple(shades))
 
 
 def _cover(outlines: tuple[Outline, ...], shift: Floats, shape: tuple[int, ...]) -> Map:
     """Share (H, W) of each pixel that outlines cover."""
     mask, width = np.zeros(shape[:2], np.uint8), shape[1]
-    for kind, points, wide in outlines:
+    for kind, points, thickness in outlines:
         places = np.clip(np.rint((points + shift) * width * 16), -(2**15), 2**15).astype(np.int32)
         if kind == "line":
-            cv2.polylines(mask, [places], False, 255, max(1, round(wide * width)), cv2.LINE_AA, 4)
+            cv2.polylines(mask, [places], False, 255, max(1, round(thickness * width)), cv2.LINE_AA, 4)
         else:
             cv2.fillPoly(mask, [places], 255, cv2.LINE_AA, 4)
     return np.asarray(mask / np.float32(255), np.float32)

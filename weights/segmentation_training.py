@@ -40,39 +40,43 @@ Example = tuple[Pixels, Pixels, Map, Map]  # frame, rest (H, W, 3) uint8; classe
 def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator) -> Example:
     """A frame, its rest frame, and the classes to be found."""
     if rng.random() < _PLAIN:
-        rest, now, weight = _warped(sequences, photographs, rng)
+        rest, now, weight = _draw_warped(sequences, photographs, rng)
     else:
-        rest, now, weight = _rendered(sequences[int(rng.integers(len(sequences)))], rng)
+        rest, now, weight = _draw_rendered(sequences[int(rng.integers(len(sequences)))], rng)
     if rng.random() < _PASTED or (now.instrument.max() == 0 and rng.random() < 0.5):
         other = _square(photographs, rng)
         for _ in range(int(rng.choice([1, 1, 2, 3]))):
             draw = paste.draw_object if rng.random() < 0.25 else paste.draw_instrument
-            thing = draw(rng, now.picture, other)
-            now = paste.paste(now, thing, np.zeros(2))
+            sprite = draw(rng, now.picture, other)
+            now = paste.paste(now, sprite, np.zeros(2))
             if rng.random() < _REST:
-                rest = paste.paste(rest, thing, rng.normal(0, 0.15, 2) * (rng.random() < 0.7))
+                rest = paste.paste(rest, sprite, rng.normal(0, 0.15, 2) * (rng.random() < 0.7))
     if rng.random() < 0.3:
-        seed, moved = rng.integers(2**31), int(rng.random() < 0.5)  # often highlights stay
-        both = (now, moved), (rest, 0)
-        now, rest = (paste.add_highlights(a, np.random.default_rng(seed + b)) for a, b in both)
-    found = np.stack([getattr(now, name) for name in CLASSES], -1)
-    found[..., 1] = np.clip(found[..., 1] / _SHADED, 0, 1)
-    return *_developed(now.picture, rest.picture, rng), found, weight
+        seed, seed_step = rng.integers(2**31), int(rng.random() < 0.5)  # often highlights stay
+        layers = (now, seed_step), (rest, 0)
+        now, rest = (paste.add_highlights(a, np.random.default_rng(seed + b)) for a, b in layers)
+    classes = np.stack([getattr(now, name) for name in CLASSES], -1)
+    classes[..., 1] = np.clip(classes[..., 1] / _SHADED, 0, 1)
+    return *_develop(now.picture, rest.picture, rng), classes, weight
 
 
-def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
+def _draw_rendered(sequence: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
     """Layers of rest and a later frame of a sequence, by a random camera, turned and cut; and weights."""
-    right = "_right" * bool(rng.random() < 0.5 and "rgb_right" in one)
-    t = int(rng.integers(len(one["rgb"])))
-    start = 0 if rng.random() < 0.8 else int(rng.integers(len(one["rgb"])))
-    tool, nothing = one["tool" + right][t], np.zeros(one["tissue"].shape, np.float32)
-    is_shadow_known = not right and "shadow" in one
-    shadow = one["shadow"][t] / np.float32(255) if is_shadow_known else nothing
-    glare = nothing if right else one["glare"][t].astype(np.float32)
+    right = "_right" * bool(rng.random() < 0.5 and "rgb_right" in sequence)
+    t = int(rng.integers(len(sequence["rgb"])))
+    start = 0 if rng.random() < 0.8 else int(rng.integers(len(sequence["rgb"])))
+    tool, nothing = sequence["tool" + right][t], np.zeros(sequence["tissue"].shape, np.float32)
+    is_shadow_known = not right and "shadow" in sequence
+    shadow = sequence["shadow"][t] / np.float32(255) if is_shadow_known else nothing
+    glare = nothing if right else sequence["glare"][t].astype(np.float32)
     # The right picture's tissue is not stored: that of the left is near enough for a weight.
-    near = np.where(one["tissue"] | tool, 1.0, _FAR).astype(np.float32)
-    planes = [one["rgb" + right][t], one["rgb" + right][start], np.dstack([tool, shadow, glare, near])]
-    turn = _turn(one["tissue"].shape, rng)
+    tissue_weight = np.where(sequence["tissue"] | tool, 1.0, _FAR).astype(np.float32)
+    planes = [
+        sequence["rgb" + right][t],
+        sequence["rgb" + right][start],
+        np.dstack([tool, shadow, glare, tissue_weight]),
+    ]
+    turn = _turn(sequence["tissue"].shape, rng)
     mode = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
     now, rest, flat = (cv2.warpAffine(np.asarray(p, np.float32), turn, _SIZE, **mode) for p in planes)
     weight = np.repeat(flat[..., 3:], len(CLASSES), -1)
@@ -93,29 +97,29 @@ def _turn(shape: tuple[int, ...], rng: np.random.Generator) -> Map:
     return np.column_stack([matrix, np.array(_SIZE) / 2 - matrix @ middle])
 
 
-def _warped(
+def _draw_warped(
     sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator
 ) -> tuple[Any, Any, Map]:
     """A picture as tissue, with what looks like objects but is tissue, at rest and moved; and weights."""
     picture, is_render = _still(sequences, photographs, rng)
-    still = paste.Layer.of(picture)
+    rest_layer = paste.Layer.of(picture)
     if rng.random() < _MARKED:
         for _ in range(int(rng.integers(1, 4))):
-            thing = paste.draw_marking(rng, still.picture, _square(photographs, rng))
-            still = paste.Layer.of(paste.paste(still, thing, np.zeros(2)).picture)
+            sprite = paste.draw_marking(rng, rest_layer.picture, _square(photographs, rng))
+            rest_layer = paste.Layer.of(paste.paste(rest_layer, sprite, np.zeros(2)).picture)
     if rng.random() < _VESSELS:
-        still = paste.add_vessels(still, rng)
+        rest_layer = paste.add_vessels(rest_layer, rng)
     size = max(_SIZE)
     flow = cv2.resize(draw_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
     y, x = np.mgrid[: _SIZE[1], : _SIZE[0]].astype(np.float32)
     x, y = x - flow[..., 0], y - flow[..., 1]
-    moved, highlight = (
+    moved_picture, highlight = (
         cv2.remap(plane, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        for plane in (still.picture, still.highlight)
+        for plane in (rest_layer.picture, rest_layer.highlight)
     )
     weight = np.ones((*_SIZE[::-1], len(CLASSES)), np.float32)
     weight[..., 2] *= not is_render  # its own highlights move otherwise
-    return still, replace(still, picture=moved, highlight=np.clip(highlight, 0, 1)), weight
+    return rest_layer, replace(rest_layer, picture=moved_picture, highlight=np.clip(highlight, 0, 1)), weight
 
 
 def _still(
@@ -143,14 +147,14 @@ def _square(photographs: Sequence[Map], rng: np.random.Generator) -> Map:
     return np.asarray(np.clip(part @ mix.T * rng.uniform(0.5, 1.2), 0, 255), np.float32)
 
 
-def _developed(now: Map, rest: Map, rng: np.random.Generator) -> list[Any]:
+def _develop(now: Map, rest: Map, rng: np.random.Generator) -> list[Any]:
     """Both pictures by one camera whose light changes a little."""
     gain, gamma, white = rng.uniform(0.6, 1.3), np.exp(rng.normal(0, 0.2)), np.exp(rng.normal(0, 0.12, 3))
     blur, noise = rng.choice([0, 0, 0.6, 1.2]), rng.choice([0.3, 1, 2, 5])
     quality = int(rng.choice([0, 0, 90, 70, 45]))
     grey, drift = rng.random() < 0.08, rng.random() < 0.3
     coarse = 1.0 if rng.random() < 0.7 else rng.uniform(1, 3)
-    made = []
+    pictures = []
     for k, picture in enumerate((now, rest)):
         light: Any = np.float32(gain)
         if drift and k == 0:
@@ -167,13 +171,13 @@ def _developed(now: Map, rest: Map, rng: np.random.Generator) -> list[Any]:
         if grey:
             level = np.repeat(level.mean(-1, keepdims=True), 3, -1)
         level += np.float32(noise) * rng.standard_normal(level.shape, np.float32)
-        taken = jpeg(np.clip(level, 0, 255).astype(np.uint8), quality)
-        made.append(taken if coarse == 1 else cv2.resize(taken, _SIZE, interpolation=cv2.INTER_CUBIC))
-    return made
+        encoded = jpeg(np.clip(level, 0, 255).astype(np.uint8), quality)
+        pictures.append(encoded if coarse == 1 else cv2.resize(encoded, _SIZE, interpolation=cv2.INTER_CUBIC))
+    return pictures
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn(Dataset[Any]):
+class _DrawnExamples(Dataset[Any]):
     """New examples by their number, the same whenever they are drawn."""
 
     sequences: Sequence[Any]
@@ -187,13 +191,13 @@ class _Drawn(Dataset[Any]):
 
     def __getitem__(self, k: int) -> Tensor:
         rng = np.random.default_rng([self.seed, self.numbers[k]])
-        drawn = [example(self.sequences, self.photographs, rng) for _ in range(self.new)]
-        return torch.stack([packed(one) for one in drawn])
+        examples = [example(self.sequences, self.photographs, rng) for _ in range(self.new)]
+        return torch.stack([pack(entry) for entry in examples])
 
 
-def packed(one: Example) -> Tensor:
+def pack(entry: Example) -> Tensor:
     """Planes (12, H, W) uint8 of an example: frame, rest frame, classes and weights."""
-    planes = *one[:2], *(np.rint(255 * plane).astype(np.uint8) for plane in one[2:])
+    planes = *entry[:2], *(np.rint(255 * plane).astype(np.uint8) for plane in entry[2:])
     return torch.from_numpy(np.concatenate(planes, -1)).permute(2, 0, 1).contiguous()
 
 
@@ -203,16 +207,16 @@ def batch(examples: Tensor, rng: np.random.Generator) -> tuple[Tensor, ...]:
     They are mirrored and their colours are exchanged, alike in groups of four to save calls.
     """
     parts = []
-    for some in torch.split(examples, 4):
+    for chunk in torch.split(examples, 4):
         axes = [axis for axis in (-2, -1) if rng.random() < 0.5]
         order = rng.permutation(3)
-        planes = torch.as_tensor(np.concatenate([order, 3 + order, np.arange(6, 12)]), device=some.device)
-        parts.append(some[:, planes].flip(axes))
-    turned = torch.cat(parts)
-    classes, weights = turned[:, 6:9].float() / 255, turned[:, 9:].float() / 255
-    both = turned[:, :6].float().reshape(-1, 2, 3, *_SIZE[::-1])
-    deviation, mean = torch.std_mean(both, (2, 3, 4), correction=0, keepdim=True)
-    return ((both - mean) / (deviation + 8.0)).flatten(1, 2), classes, weights  # as `segmentation.prepare`
+        planes = torch.as_tensor(np.concatenate([order, 3 + order, np.arange(6, 12)]), device=chunk.device)
+        parts.append(chunk[:, planes].flip(axes))
+    augmented = torch.cat(parts)
+    classes, weights = augmented[:, 6:9].float() / 255, augmented[:, 9:].float() / 255
+    frames = augmented[:, :6].float().reshape(-1, 2, 3, *_SIZE[::-1])
+    deviation, mean = torch.std_mean(frames, (2, 3, 4), correction=0, keepdim=True)
+    return ((frames - mean) / (deviation + 8.0)).flatten(1, 2), classes, weights  # as `segmentation.prepare`
 
 
 def train(
@@ -240,28 +244,28 @@ def train(
     optimiser = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps, pct_start=0.1)
     parts: dict[str, Any] = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
-    begun, recent, began = 0, deque[Tensor](maxlen=100), time.time()
+    first_step, recent, start_s = 0, deque[Tensor](maxlen=100), time.time()
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=False)
-        begun = state["step"]
+        first_step = state["step"]
         for name, part in parts.items():
             part.load_state_dict(state[name])
     ahead = -(-4 * count // new)  # the first step has some choice
-    numbers = range(max(0, begun + ahead - latest // new - 1), steps + ahead)
-    source = _Drawn(sequences, photographs_of("tuning", _PHOTOGRAPH), seed, new, numbers)
+    numbers = range(max(0, first_step + ahead - latest // new - 1), steps + ahead)
+    source = _DrawnExamples(sequences, photographs_of("tuning", _PHOTOGRAPH), seed, new, numbers)
     pool = torch.empty(latest, 12, *_SIZE[::-1], dtype=torch.uint8, device=device)
     net.train()
     # All processes share the memory of the sequences.
     loader = DataLoader(source, None, num_workers=workers, multiprocessing_context="fork")
-    for number, drawn in zip(numbers, loader, strict=True):
+    for number, examples in zip(numbers, loader, strict=True):
         places = torch.arange(number * new, (number + 1) * new) % latest
-        pool[places.to(device)] = drawn.to(device)
+        pool[places.to(device)] = examples.to(device)
         step = number - ahead
-        if step < begun:
+        if step < first_step:
             continue
         rng = np.random.default_rng([seed, number, 1])  # so that a resumed run is the same
-        chosen = rng.choice(min((number + 1) * new, latest), count, replace=False)
-        inputs, classes, weights = batch(pool[torch.from_numpy(chosen).to(device)], rng)
+        indices = rng.choice(min((number + 1) * new, latest), count, replace=False)
+        inputs, classes, weights = batch(pool[torch.from_numpy(indices).to(device)], rng)
         with torch.autocast(device, torch.bfloat16, enabled=device != "cpu"):
             logits = net(inputs.contiguous(memory_format=torch.channels_last))
         loss = _loss(logits.float(), classes, weights)
@@ -274,18 +278,18 @@ def train(
         recent.append(loss.detach())
         if (step + 1) % 100 == 0:
             mean = float(torch.stack([*recent]).mean())
-            print(f"step {step + 1} of {steps}: loss {mean:.4f}, {time.time() - began:.0f} s", flush=True)
+            print(f"step {step + 1} of {steps}: loss {mean:.4f}, {time.time() - start_s:.0f} s", flush=True)
             states = {name: part.state_dict() for name, part in parts.items()}
             torch.save({"step": step + 1} | states, checkpoint.with_suffix(".part"))
             checkpoint.with_suffix(".part").rename(checkpoint)
-    frames = sum(len(one["rgb"]) * (1 + ("rgb_right" in one)) for one in sequences)
+    frames = sum(len(sequence["rgb"]) * (1 + ("rgb_right" in sequence)) for sequence in sequences)
     return average.cpu().eval(), {"frames": frames, "steps": steps, "batch": count}
 
 
 def _loss(logits: Tensor, classes: Tensor, weights: Tensor) -> Tensor:
     """Cross-entropy plus one minus the soft Dice overlap of each class."""
-    found = torch.sigmoid(logits)
-    both = (weights * found * classes).sum((0, 2, 3))
-    either = (weights * (found + classes)).sum((0, 2, 3))
+    probability = torch.sigmoid(logits)
+    intersection = (weights * probability * classes).sum((0, 2, 3))
+    union = (weights * (probability + classes)).sum((0, 2, 3))
     entropy = F.binary_cross_entropy_with_logits(logits, classes, weights)
-    return 2 * entropy + (1 - (2 * both + 50) / (either + 50)).mean()
+    return 2 * entropy + (1 - (2 * intersection + 50) / (union + 50)).mean()

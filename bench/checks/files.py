@@ -36,23 +36,23 @@ def check_notes(recording: Recording) -> list[Finding]:
 def check_tool(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masks of the tool."""
     message = recording.describe_tool(len(tracked.decoded))
-    found = [Finding("ok" if recording.masks else "missing", "tool", message)]
+    findings = [Finding("ok" if recording.masks else "missing", "tool", message)]
     numbers, shares = [number for number, _ in tracked.decoded], []
     for k in np.linspace(0, len(numbers) - 1, min(_MASKS_READ, len(numbers))).astype(int):
         with suppress(UserError):  # tracking reports it
             mask = recording.masks.read(numbers[k], tracked.size)
             shares += [] if mask is None else [float(mask.mean())]
     if shares and (share := float(np.median(shares))) > _INVERTED:
-        wrong = f"the masks are white on {100 * share:.0f}% of the picture, as if on the tissue: invert them"
-        found.append(Finding("warning", "tool", wrong))
-    return found
+        doubt = f"the masks are white on {100 * share:.0f}% of the picture, as if on the tissue: invert them"
+        findings.append(Finding("warning", "tool", doubt))
+    return findings
 
 
 def check_pictures(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on number and size of the pictures, and those that tracking collects."""
     height, width = tracked.size
     message = f"{len(tracked.decoded)} frames of {width} x {height} px"
-    found = [Finding("ok", "pictures", message)] * bool(tracked.decoded) + tracked.findings
+    findings = [Finding("ok", "pictures", message)] * bool(tracked.decoded) + tracked.findings
     times = [time_s for _, time_s in tracked.decoded if time_s is not None]
     if isinstance(recording.footage, VideoFile) and recording.times_s is None and len(times) > 1:
         with suppress(UserError):  # reading the pictures reports it
@@ -60,19 +60,19 @@ def check_pictures(recording: Recording, tracked: TrackedRecording) -> list[Find
             end_s = max(times) + _SPARE_STEPS * (max(times) - min(times)) / (len(times) - 1)
             late_s = 0.0 if recording.footage.from_file else find_start(recording.footage)
             if stated_s > end_s + max(late_s, _SPARE_S):
-                cut = f"the video states {stated_s:.2f} s, but its pictures end at {max(times):.2f} s"
-                found.append(
-                    Finding("warning", "pictures", f"{cut}: it is cut off or damaged, copy it again")
+                fault = f"the video states {stated_s:.2f} s, but its pictures end at {max(times):.2f} s"
+                findings.append(
+                    Finding("warning", "pictures", f"{fault}: it is cut off or damaged, copy it again")
                 )
-    return found
+    return findings
 
 
 def check_tracking(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masked tissue and lost frames."""
     summary = tracked.summary
-    many = summary.shares["masked"] > _MANY or summary.shares["lost"] > _FEW
+    is_doubtful = summary.shares["masked"] > _MANY or summary.shares["lost"] > _FEW
     message = summary.describe()
-    return [Finding("warning" if many else "ok", "tracking", message)] if summary.frames else []
+    return [Finding("warning" if is_doubtful else "ok", "tracking", message)] if summary.frames else []
 
 
 def check_stiffness(recording: Recording) -> list[Finding]:
@@ -81,24 +81,26 @@ def check_stiffness(recording: Recording) -> list[Finding]:
     if meta.young_kpa is None:
         return [Finding("missing", "stiffness", _NO_YOUNG)]
     stated = f"E = {meta.young_kpa:g} kPa ± {100 * meta.young_uncertainty:.2g}%"
-    wrong = judge_young(meta.young_kpa, meta.tissue == "phantom")
-    return wrong or [Finding("ok", "stiffness", stated)]
+    doubts = judge_young(meta.young_kpa, meta.tissue == "phantom")
+    return doubts or [Finding("ok", "stiffness", stated)]
 
 
 def check_scale(recording: Recording) -> list[Finding]:
     """Findings on the stated or calibrated scale."""
     try:
-        found = recording.scale
+        scale = recording.scale
     except UserError as error:
         return [Finding("error", "scale", str(error))]
-    message = f"{found.mm_per_px:.4g} mm/px ± {100 * found.uncertainty:.2g}% ({found.source})"
+    message = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
     return [Finding("ok", "scale", message)]
 
 
 def check_tissue(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on a stated tissue that is too small to be one, and on the cost of a found one in doubt."""
     if recording.tissue is None:
-        doubts = {"error", "warning"} & {one.severity for one in tracked.findings if one.cause == "tissue"}
+        doubts = {"error", "warning"} & {
+            finding.severity for finding in tracked.findings if finding.cause == "tissue"
+        }
         return [Finding("missing", "tissue", _WRONG_TISSUE)] if doubts else []
     if not tracked.decoded:
         return []

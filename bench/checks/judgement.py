@@ -45,9 +45,9 @@ def judge(
     recording: Recording, tracked: TrackedRecording, sensor: SensorMotion | None = None
 ) -> list[Finding]:
     """Findings of every check, errors first. `tracked`: if that failed, with the decoded pictures only."""
-    found = [one for check in RECORDING_CHECKS for one in check(recording)]
-    found += [one for check in TRACKED_CHECKS for one in check(recording, tracked)]
+    findings = [finding for check in RECORDING_CHECKS for finding in check(recording)]
+    findings += [finding for check in TRACKED_CHECKS for finding in check(recording, tracked)]
     # Forces that are not valid contradict any sensor.
-    if sensor is not None and not first_fault(found):
-        found = [one for check in SENSOR_CHECKS for one in check(sensor)] + found
-    return by_severity(found)
+    if sensor is not None and not first_fault(findings):
+        findings = [finding for check in SENSOR_CHECKS for finding in check(sensor)] + findings
+    return by_severity(findings)

@@ -51,8 +51,8 @@ def _has_common_clock(recording: Recording) -> bool:
     )
     if inside.sum() < 2 * _TAPS:
         return False
-    off = force.force_mn[inside] - np.median(force.force_mn[inside], axis=0)
-    size = np.pad(np.linalg.norm(off, axis=1), 1)
+    deviation = force.force_mn[inside] - np.median(force.force_mn[inside], axis=0)
+    size = np.pad(np.linalg.norm(deviation, axis=1), 1)
     step_s = float(np.median(np.diff(t[inside])))
     limits = {"prominence": _TAP_SHARE * float(size.max()), "width": (None, _TAP_S / max(step_s, 1e-9))}
     return len(find_peaks(size, **limits)[0]) >= _TAPS
@@ -66,13 +66,15 @@ def read_steps() -> list[dict[str, str]]:
 
 def check_protocol(recording: Recording) -> list[Finding]:
     """Findings on the steps: one for all that the recording has, and one for each that it lacks."""
-    known = [(step, _IS_IN[step["title"]](recording)) for step in read_steps() if step["title"] in _IS_IN]
-    has = [step["title"] for step, done in known if done]
-    found = [Finding("ok", "protocol", f"{len(has)} of {len(known)} steps: {', '.join(has) or 'none'}")]
-    for step in (step for step, done in known if not done):
+    steps = [(step, _IS_IN[step["title"]](recording)) for step in read_steps() if step["title"] in _IS_IN]
+    present = [step["title"] for step, is_present in steps if is_present]
+    findings = [
+        Finding("ok", "protocol", f"{len(present)} of {len(steps)} steps: {', '.join(present) or 'none'}")
+    ]
+    for step in (step for step, is_present in steps if not is_present):
         message = f"{step['title']}: without it, {step['without']}. {step['how']}"
-        found.append(Finding("missing", "protocol", message))
-    return found
+        findings.append(Finding("missing", "protocol", message))
+    return findings
 
 
 def as_markdown() -> str:

@@ -43,49 +43,49 @@ def check_samples(recording: Recording) -> list[Finding]:
     force = recording.force
     if force is None:
         return [Finding("missing", "sensor", "no force.csv: predictions only, nothing is scored")]
-    t, most = force.time_s, float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
+    t, peak_mn = force.time_s, float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
     rate = (len(t) - 1) / (t[-1] - t[0])
-    found = [Finding("ok", "sensor", f"{len(t)} samples at {rate:.4g} Hz, up to {most:.3g} mN")]
-    if most > _SURGICAL_MN and recording.meta.tissue != "phantom":
-        message = f"{most / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
-        found.append(Finding("warning", "sensor", message))
+    findings = [Finding("ok", "sensor", f"{len(t)} samples at {rate:.4g} Hz, up to {peak_mn:.3g} mN")]
+    if peak_mn > _SURGICAL_MN and recording.meta.tissue != "phantom":
+        message = f"{peak_mn / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
+        findings.append(Finding("warning", "sensor", message))
     spikes_s, height_mn = find_spikes(t, force.force_mn)
     if len(spikes_s):
-        some = ", ".join(f"{time:.2f}" for time in spikes_s[:_NAMED_SPIKES])
-        message = f"{len(spikes_s)} spikes of up to {height_mn:.3g} mN and one or two samples (at {some}"
+        times = ", ".join(f"{time:.2f}" for time in spikes_s[:_NAMED_SPIKES])
+        message = f"{len(spikes_s)} spikes of up to {height_mn:.3g} mN and one or two samples (at {times}"
         message += ", ... s)" if len(spikes_s) > _NAMED_SPIKES else " s)"
-        found.append(Finding("warning", "sensor", message + ": a loose cable? Leave these samples empty"))
+        findings.append(Finding("warning", "sensor", message + ": a loose cable? Leave these samples empty"))
     if not recording.meta.sensor.free_s and (bias := find_bias(force.force_mn)):
-        found.append(Finding("warning", "sensor", bias))
+        findings.append(Finding("warning", "sensor", bias))
     if not recording.meta.sensor.free_s:
         message = "no sensor.free_s: no tare, no drift correction, no noise floor"
-        found.append(Finding("missing", "sensor", message))
-    return found
+        findings.append(Finding("missing", "sensor", message))
+    return findings
 
 
 def check_free_spans(recording: Recording) -> list[Finding]:
     """Findings on spans without contact: no samples, or a load."""
-    force, found = recording.force, list[Finding]()
+    force, findings = recording.force, list[Finding]()
     if force is None:
-        return found
+        return findings
     known = np.isfinite(force.force_mn).all(axis=1)
-    whole = np.percentile(force.force_mn[known], (0.5, 99.5), axis=0) if known.any() else np.zeros((2, 3))
-    most = float(np.linalg.norm(np.ptp(whole, axis=0)))
+    ends_mn = np.percentile(force.force_mn[known], (0.5, 99.5), axis=0) if known.any() else np.zeros((2, 3))
+    range_mn = float(np.linalg.norm(np.ptp(ends_mn, axis=0)))
     for start, stop in recording.meta.sensor.free_s:
         inside = (force.time_s >= start) & (force.time_s <= stop)
-        free = force.force_mn[inside & known]
+        free_mn = force.force_mn[inside & known]
         if not inside.any():
             message = f"sensor.free_s: no samples between {start:g} and {stop:g} s"
-            found.append(Finding("error", "sensor", message))
-        elif len(free) > 2:
-            change, noise = find_change(free)
-            if change > max(_LOADED * most, _SIGMAS * noise):
+            findings.append(Finding("error", "sensor", message))
+        elif len(free_mn) > 2:
+            change, noise = find_change(free_mn)
+            if change > max(_LOADED * range_mn, _SIGMAS * noise):
                 message = (
                     f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s: "
                 )
                 message += "there is a contact in it; end the span before, or begin it after"
-                found.append(Finding("warning", "sensor", message))
-    return found
+                findings.append(Finding("warning", "sensor", message))
+    return findings
 
 
 def find_spikes(time_s: Floats, force_mn: Floats) -> tuple[Floats, float]:
@@ -95,10 +95,10 @@ def find_spikes(time_s: Floats, force_mn: Floats) -> tuple[Floats, float]:
     t, force = time_s[known], force_mn[known]
     if len(t) < 2 * _SAMPLES or (len(t) - 1) / np.ptp(t) < _SPIKE_HZ:
         return np.zeros(0), 0.0
-    off = np.linalg.norm(force - median_filter(force, (5, 1), mode="nearest"), axis=1)
-    most = float(np.linalg.norm(np.ptp(np.percentile(force, (2, 98), axis=0), axis=0)))
-    leaps = off > max(_SPIKE * most, _SPIKE_SIGMAS * 1.4826 * float(np.median(off)))
-    return t[leaps], float(off[leaps].max(initial=0.0))
+    deviation = np.linalg.norm(force - median_filter(force, (5, 1), mode="nearest"), axis=1)
+    range_mn = float(np.linalg.norm(np.ptp(np.percentile(force, (2, 98), axis=0), axis=0)))
+    leaps = deviation > max(_SPIKE * range_mn, _SPIKE_SIGMAS * 1.4826 * float(np.median(deviation)))
+    return t[leaps], float(deviation[leaps].max(initial=0.0))
 
 
 def find_change(force_mn: Floats) -> tuple[float, float]:
@@ -121,39 +121,39 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
         return []
     offset_s = sync.offset_s if sync.method == "offset" else 0.0
     try:
-        tared = process_force(force, recording.meta.sensor, offset_s, sync.rate)
+        processed = process_force(force, recording.meta.sensor, offset_s, sync.rate)
     except UserError:  # `check_free_spans` and the scores report it
         return []
-    known = np.isfinite(tared.force_mn).all(axis=1)
-    if not known.any() or (not recording.meta.sensor.free_s and find_bias(tared.force_mn)):
+    known = np.isfinite(processed.force_mn).all(axis=1)
+    if not known.any() or (not recording.meta.sensor.free_s and find_bias(processed.force_mn)):
         return []  # `check_samples` reports the constant part, which is no load
-    t, size = tared.time_s[known], np.linalg.norm(tared.force_mn[known], axis=1)
-    least, most = float(size.min()), float(size.max())
-    there = float(np.interp(rest_s, t, size))
-    near_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # the sensor may start a sample later
-    limit = max(_LOADED * (most - least), _SIGMAS * tared.noise_floor_mn)
-    if not t[0] - near_s <= rest_s <= t[-1] + near_s or there - least <= limit:
+    t, size = processed.time_s[known], np.linalg.norm(processed.force_mn[known], axis=1)
+    least_mn, most_mn = float(size.min()), float(size.max())
+    rest_mn = float(np.interp(rest_s, t, size))
+    step_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # the sensor may start a sample later
+    limit = max(_LOADED * (most_mn - least_mn), _SIGMAS * processed.noise_floor_mn)
+    if not t[0] - step_s <= rest_s <= t[-1] + step_s or rest_mn - least_mn <= limit:
         return []
-    lowest = f"the minimum is {least:.3g} mN at {t[size.argmin()]:.3g} s"
+    lowest = f"the minimum is {least_mn:.3g} mN at {t[size.argmin()]:.3g} s"
     message = (
-        f"the sensor measures {there:.3g} mN at the rest frame; {lowest}: set rest_frame to a frame there"
+        f"the sensor measures {rest_mn:.3g} mN at the rest frame; {lowest}: set rest_frame to a frame there"
     )
     return [Finding("warning", "rest frame", message)]
 
 
 def check_start(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings, from the video alone, on a rest frame under load if there is no sensor that shows it."""
-    moved = next((tracked.force_mn[name] for name in flow_sizes() if name in tracked.force_mn), None)
+    motion = next((tracked.force_mn[name] for name in flow_sizes() if name in tracked.force_mn), None)
     known = np.array(tracked.trusted)
-    if recording.force is not None or moved is None or known.sum() < LEAST_FRAMES:
+    if recording.force is not None or motion is None or known.sum() < LEAST_FRAMES:
         return []
-    moved_mm = np.array(moved)[known, 0]
-    found = find_other_rest(np.array(tracked.time_s)[known], moved_mm)
-    if found is None or not moved_mm.max() > _MOVED_MM:
+    motion_mm = np.array(motion)[known, 0]
+    rest = find_other_rest(np.array(tracked.time_s)[known], motion_mm)
+    if rest is None or not motion_mm.max() > _MOVED_MM:
         return []
-    message = f"from {found[0]:.3g} s the tissue rests in another state than the rest frame's: the video "
+    message = f"from {rest[0]:.3g} s the tissue rests in another state than the rest frame's: the video "
     message += "starts under load, or a tool holds the tissue at its end"
-    return [Finding("warning" if found[1] else "missing", "rest frame", message)]
+    return [Finding("warning" if rest[1] else "missing", "rest frame", message)]
 
 
 def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
@@ -166,16 +166,21 @@ def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
     share = moved / max(float(moved.max()), 1e-12)
     calm = np.abs(np.diff(share, prepend=share[0])) < _CALM
 
-    def runs(state: Mask) -> list[tuple[float, float]]:
+    def find_runs(state: Mask) -> list[tuple[float, float]]:
         """Start and duration [s] of each run."""
         edges = np.flatnonzero(np.diff(np.concatenate([[False], state, [False]])))
         return [(time_s[a], time_s[b - 1] - time_s[a]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
-    since_s = max((start for start, lasts in runs(calm & (share > 0.5)) if lasts >= _RESTS_S), default=np.inf)
+    since_s = max(
+        (start for start, duration_s in find_runs(calm & (share > 0.5)) if duration_s >= _RESTS_S),
+        default=np.inf,
+    )
     # A plateau of a contact is left again.
     if not since_s < np.inf or (share[time_s >= since_s] < 0.5).any():
         return None
-    return float(since_s), max((lasts for _, lasts in runs(calm & (share < 0.3))), default=0.0) < _LEFT_S
+    return float(since_s), max(
+        (duration_s for _, duration_s in find_runs(calm & (share < 0.3))), default=0.0
+    ) < _LEFT_S
 
 
 @dataclass(frozen=True)
@@ -220,19 +225,19 @@ def find_sensor_motion(
     scored: Mask,
 ) -> SensorMotion | None:
     """Sensor and motion in the frames (T,) to be scored; None without a sensor, motion or enough frames."""
-    moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
-    if sensor.axes_mn is None or moved is None:
+    motion_name = next((name for name, method in methods.items() if isinstance(method, FlowSize)), None)
+    if sensor.axes_mn is None or motion_name is None:
         return None
-    size = np.array(tracked.force_mn[moved])[:, 0]
+    size = np.array(tracked.force_mn[motion_name])[:, 0]
     known = np.isfinite(sensor.axes_mn).all(axis=1) & np.isfinite(size) & np.array(tracked.trusted) & scored
     if known.sum() < LEAST_FRAMES or not np.ptp(size[known]) > 0:
         return None
     forces, leading = [], None
     if recording.meta.young_kpa is not None:
         # A fusion is not an independent estimate.
-        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Fusion))]
-        every = [np.nan_to_num(tracked.force_mn[name]) for name in alone]
-        forces = [force[known] for force in every if force.any()]
+        independent = [n for n, method in methods.items() if not isinstance(method, (FlowSize, Fusion))]
+        method_forces = [np.nan_to_num(tracked.force_mn[name]) for name in independent]
+        forces = [force[known] for force in method_forces if force.any()]
         if not isinstance(methods[main], FlowSize):
             leading = np.nan_to_num(tracked.force_mn[main])[known]
     axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
@@ -246,7 +251,7 @@ def find_sensor_motion(
         axes if sensor.in_camera_axes else 0,
         leading,
         np.array(tracked.bounds[main], np.float64)[known],
-        next((one for one in sensor.axes_mn[:2] if np.isfinite(one).all()), None),  # it may start later
+        next((force for force in sensor.axes_mn[:2] if np.isfinite(force).all()), None),  # it may start later
         sensor.noise_floor_mn,
         bool(tracked.pulse),
         main not in tracked.uncalibrated,
@@ -278,9 +283,9 @@ def check_constant(sensor: SensorMotion) -> list[Finding]:
         return [Finding("error" if size else "warning", "sensor", message)]
     for k, values in enumerate(sensor.axes_mn.T):
         for run in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
-            constant = len(run) > _CONSTANT and values[run[0]] and np.ptp(values)
-            if constant and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
+            is_constant = len(run) > _CONSTANT and values[run[0]] and np.ptp(values)
+            if is_constant and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
                 span = f"{t[run[0]]:.3g} to {t[run[-1]]:.3g} s"
-                what = f"f{'xyz'[k]}_n is constant at {values[run[0]]:.3g} mN from {span}"
-                return [Finding("warning", "sensor", f"{what} while the tissue moves: saturated, or stuck?")]
+                fault = f"f{'xyz'[k]}_n is constant at {values[run[0]]:.3g} mN from {span}"
+                return [Finding("warning", "sensor", f"{fault} while the tissue moves: saturated, or stuck?")]
     return []

@@ -28,22 +28,22 @@ def check_times(recording: Recording, tracked: TrackedRecording) -> list[Finding
         return [Finding("error", "times", "fewer than two frames have a time")]
     # From first to last frame: the median interval misleads where stamps come in bursts.
     steps, rate = np.diff(t), (len(t) - 1) / (t[-1] - t[0])
-    found = [Finding("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")]
+    findings = [Finding("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")]
     timeless = sum(time_s is None for _, time_s in tracked.decoded)
-    back = len(tracked.decoded) - timeless - len(t)
+    backward = len(tracked.decoded) - timeless - len(t)
     doubts = []
-    if timeless or back:
-        doubts.append(f"{timeless} frames without a time, {back} backwards in time")
+    if timeless or backward:
+        doubts.append(f"{timeless} frames without a time, {backward} backwards in time")
     if gaps := int((steps > _GAP * np.median(steps)).sum()):
         doubts.append(f"{gaps} gaps, the longest {steps.max():.3g} s")
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
         doubts.append(f"{rate:.3g} frames per second: are the times in seconds?")
-    return found + [Finding("warning", "times", doubt) for doubt in doubts]
+    return findings + [Finding("warning", "times", doubt) for doubt in doubts]
 
 
 def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on the spans for calibration: too short, or outside the video."""
-    meta, t, found = recording.meta, _rising_times(tracked), []
+    meta, t, findings = recording.meta, _rising_times(tracked), []
     if len(t) < 2:
         return []
     rate = min((len(t) - 1) / (t[-1] - t[0]), _TRACKED_HZ)
@@ -56,8 +56,8 @@ def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding
         if span is not None:
             inside_s = max(min(span[1], t[-1]) - max(span[0], t[0]), 0.0)
             message = f"{name} covers {inside_s:.3g} s of video; at least {frames / rate:.3g} s are needed"
-            found.append(Finding("ok" if inside_s >= frames / rate else "warning", "spans", message))
-    return found
+            findings.append(Finding("ok" if inside_s >= frames / rate else "warning", "spans", message))
+    return findings
 
 
 def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
@@ -76,31 +76,39 @@ def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Findi
     share = max(min(t[-1], last) - max(t[0], first), 0.0) / (t[-1] - t[0])
     message = f"the sensor covers {100 * share:.0f}% of the video"
     message += "" if share else ": are both clocks in seconds?"
-    return [Finding("ok" if share > _COVERED else "warning", "clocks", message), *_stamped_rate(t, recording)]
+    return [
+        Finding("ok" if share > _COVERED else "warning", "clocks", message),
+        *_check_stamped_rate(t, recording),
+    ]
 
 
-def _stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
+def _check_stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
     """A finding on records whose lengths are as the usual rates of cameras, as if one were stamped for
     another."""
     force, sync = recording.force, recording.meta.sync
     if force is None or sync.rate != 1 or sync.method == "correlate":
         return []
     step = (t[-1] - t[0]) / (len(t) - 1)
-    stamped, video_s, sensor_s = 1 / step, t[-1] - t[0] + step, float(np.ptp(force.time_s))
-    together = abs(force.time_s[0] + sync.offset_s * (sync.method == "offset") - t[0]) < _TOGETHER_S
-    for taken in _CAMERAS_HZ:
-        likely = min(_CAMERAS_HZ, key=lambda rate: abs(rate / stamped - 1))
-        if abs(likely / stamped - 1) > _SAME_RATE or taken == likely or not together or sensor_s < _LEAST_S:
+    measured_hz, video_s, sensor_s = 1 / step, t[-1] - t[0] + step, float(np.ptp(force.time_s))
+    start_together = abs(force.time_s[0] + sync.offset_s * (sync.method == "offset") - t[0]) < _TOGETHER_S
+    for taken_hz in _CAMERAS_HZ:
+        stamped_hz = min(_CAMERAS_HZ, key=lambda rate: abs(rate / measured_hz - 1))
+        if (
+            abs(stamped_hz / measured_hz - 1) > _SAME_RATE
+            or taken_hz == stamped_hz
+            or not start_together
+            or sensor_s < _LEAST_S
+        ):
             continue
-        if abs(sensor_s / video_s * taken / likely - 1) < max(_SAME_RATE, 1.5 * step / video_s):
-            rate = taken / likely
+        if abs(sensor_s / video_s * taken_hz / stamped_hz - 1) < max(_SAME_RATE, 1.5 * step / video_s):
+            rate = taken_hz / stamped_hz
             return [
                 Finding(
                     "warning",
                     "clocks",
-                    f"the sensor's record is {1 / rate:.4g} times as long as the video, as if "
-                    "pictures taken at "
-                    f"{taken:g} a second were stamped as {likely:g}: if so, set sync.rate to {rate:.4f}",
+                    f"the sensor's record is {1 / rate:.4g} times as long as the video, as if pictures "
+                    f"taken at {taken_hz:g} a second were stamped as {stamped_hz:g}: if so, set sync.rate to "
+                    f"{rate:.4f}",
                 )
             ]
     return []
@@ -112,9 +120,9 @@ def check_margin(recording: Recording, tracked: TrackedRecording) -> list[Findin
     if force is None or sync.method != "correlate" or sync.calibration_s is None:
         return []
     (start, stop), t, margin = sync.calibration_s, sync.rate * force.time_s, sync.search_s
-    lacks = max(t[0] - (start - margin), (stop + margin) - t[-1], 0.0)
-    message = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
-    return [Finding("warning", "clocks", message)] if lacks > 0 else []
+    missing_s = max(t[0] - (start - margin), (stop + margin) - t[-1], 0.0)
+    message = f"force.csv lacks {missing_s:.3g} s of sync.calibration_s and {margin:g} s on either side"
+    return [Finding("warning", "clocks", message)] if missing_s > 0 else []
 
 
 def _rising_times(tracked: TrackedRecording) -> Floats:

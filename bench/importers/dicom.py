@@ -27,53 +27,53 @@ def open_dicom(source: Path, notes: list[str]) -> tuple[Callable[[], Iterator[Ar
 
     checked_file.check_file(source, LARGEST_BYTES)
     try:
-        about = dcmread(source, defer_size=4096)
+        dataset = dcmread(source, defer_size=4096)
     except InvalidDicomError:
         raise UserError(f"{source}: no DICOM file: its preamble is missing") from None
-    if "PixelData" not in about:
-        kind = getattr(about, "Modality", "unknown modality")
+    if "PixelData" not in dataset:
+        kind = getattr(dataset, "Modality", "unknown modality")
         raise UserError(f"{source}: a DICOM file ({kind}) without pictures")
-    if str(about.file_meta.TransferSyntaxUID).startswith(_VIDEO):
-        video = _Extracted(about)
+    if str(dataset.file_meta.TransferSyntaxUID).startswith(_VIDEO):
+        video = _ExtractedVideo(dataset)
         times = [picture.time_s for picture in read_video(video.path)]
         return video, len(times), np.array(times, np.float64)
-    refuse_large(int(about.Columns), int(about.Rows))
-    count = int(getattr(about, "NumberOfFrames", 1) or 1)
+    refuse_large(int(dataset.Columns), int(dataset.Rows))
+    count = int(getattr(dataset, "NumberOfFrames", 1) or 1)
     if count > MOST_FRAMES:
         raise UserError(f"{source}: {count} frames, at most {MOST_FRAMES} are read")
 
     def pictures() -> Iterator[Array]:
         from pydicom.pixels import iter_pixels
 
-        return (_shown(picture, about) for picture in iter_pixels(source))
+        return (_interpret_values(picture, dataset) for picture in iter_pixels(source))
 
-    return pictures, count, _times(about, count, notes)
+    return pictures, count, _times(dataset, count, notes)
 
 
-def _shown(picture: Array, about: Any) -> Array:
+def _interpret_values(picture: Array, dataset: Any) -> Array:
     """Stored values (H, W) or (H, W, 3) as grey that rises with brightness, or as RGB; uint8 or uint16."""
-    kind = str(about.PhotometricInterpretation)
+    kind = str(dataset.PhotometricInterpretation)
     if kind == "PALETTE COLOR":
         from pydicom.pixels import apply_color_lut
 
-        return np.asarray(apply_color_lut(picture, about))
+        return np.asarray(apply_color_lut(picture, dataset))
     if kind == "MONOCHROME1":  # 0 is white; bits above those stored may hold something else
-        white = picture.dtype.type((1 << int(about.BitsStored)) - 1)
+        white = picture.dtype.type((1 << int(dataset.BitsStored)) - 1)
         return np.asarray(white - (picture & white))
     return picture
 
 
-class _Extracted:
+class _ExtractedVideo:
     """The video inside a file, in a temporary one for as long as this object lives."""
 
-    def __init__(self, about: Any) -> None:
+    def __init__(self, dataset: Any) -> None:
         from pydicom.encaps import generate_fragments
 
         self._file = tempfile.NamedTemporaryFile(suffix=".ts")  # noqa: SIM115  # deleted with this object
-        for fragment in list(generate_fragments(about.PixelData))[1:]:  # after the table of offsets
+        for fragment in list(generate_fragments(dataset.PixelData))[1:]:  # after the table of offsets
             self._file.write(fragment)
         self._file.flush()
-        self._negative = str(getattr(about, "PhotometricInterpretation", "")) == "MONOCHROME1"
+        self._negative = str(getattr(dataset, "PhotometricInterpretation", "")) == "MONOCHROME1"
         self.path = Path(self._file.name)
 
     def __call__(self) -> Iterator[Array]:
@@ -81,13 +81,13 @@ class _Extracted:
         return (255 - rgb for rgb in pictures) if self._negative else pictures
 
 
-def _times(about: Any, count: int, notes: list[str]) -> Floats | None:
+def _times(dataset: Any, count: int, notes: list[str]) -> Floats | None:
     """Times (T,) s by the frames' stated intervals or rate; None: none is stated."""
-    steps = getattr(about, "FrameTimeVector", None)
+    steps = getattr(dataset, "FrameTimeVector", None)
     if steps is not None and np.size(steps) == count:
         return np.asarray(np.cumsum(np.array(steps, np.float64)) / 1000 - float(steps[0]) / 1000, np.float64)
-    interval_ms = float(getattr(about, "FrameTime", 0) or 0)
-    rate = float(getattr(about, "CineRate", 0) or getattr(about, "RecommendedDisplayFrameRate", 0) or 0)
+    interval_ms = float(getattr(dataset, "FrameTime", 0) or 0)
+    rate = float(getattr(dataset, "CineRate", 0) or getattr(dataset, "RecommendedDisplayFrameRate", 0) or 0)
     if interval_ms > 0:
         return np.arange(count) * interval_ms / 1000
     if rate > 0:

@@ -9,7 +9,7 @@ from synth.errors import UserError
 from synth.system import checked_file
 
 _LARGEST = 1 << 42
-_STARTS = {
+_FIRST_BYTES = {
     b"\x89MCAP0\r\n": ".mcap",
     b"#ROSBAG V2.0": ".bag",
     b"SQLite format 3": ".db3",
@@ -30,7 +30,7 @@ _STARTS = {
     b"MATLAB 5.0": ".mat",
     b"version https://git-lfs": "a pointer of Git LFS: git lfs pull fetches the file",
 }
-_SAME = {".hdf5": ".h5", ".tiff": ".tif", ".webm": ".mkv"}
+_SAME_FORMAT = {".hdf5": ".h5", ".tiff": ".tif", ".webm": ".mkv"}
 _TO_VIDEO = "convert it without loss: ffmpeg -i {name} -c:v ffv1 {stem}.mkv"
 _TABLE = "a table of forces: import the video, with --use force={name}"
 _CURES = {
@@ -71,38 +71,40 @@ _DAMAGED = {
 }
 
 
-def unknown(source: Path, known: list[str]) -> UserError:
+def explain_unknown(source: Path, known: list[str]) -> UserError:
     """That a source is no format that can be imported: what it is, and the way out."""
     formats = f"formats: {', '.join(known)}, a folder of pictures, of videos or of a ROS 2 bag"
     if source.is_dir():
         if (source / "meta.yaml").is_file():
             return UserError(f"{source}: is a recording folder already: bench check reads it as it is")
         if cure := _CURES.get(source.suffix.lower()):
-            return UserError(f"{source}: {_filled(cure, source)}")
-        holds = ", ".join(sorted(path.name for path in source.iterdir())[:6]) or "nothing"
-        return UserError(f"{source}: a folder without pictures, videos or a bag; it holds {holds}; {formats}")
-    suffix, found = source.suffix.lower(), find_format(source)
-    if found.startswith("."):
-        cure = _CURES.get(suffix) or _CURES.get(found) or f"rename it to {source.stem}{found}"
-        if found in known and suffix not in _CURES:
-            cure = f"it is a {found} by its first bytes: rename it"
-        return UserError(f"{source}: {_filled(cure, source)}")
+            return UserError(f"{source}: {_fill_names(cure, source)}")
+        contents = ", ".join(sorted(path.name for path in source.iterdir())[:6]) or "nothing"
+        return UserError(
+            f"{source}: a folder without pictures, videos or a bag; it holds {contents}; {formats}"
+        )
+    suffix, kind = source.suffix.lower(), find_format(source)
+    if kind.startswith("."):
+        cure = _CURES.get(suffix) or _CURES.get(kind) or f"rename it to {source.stem}{kind}"
+        if kind in known and suffix not in _CURES:
+            cure = f"it is a {kind} by its first bytes: rename it"
+        return UserError(f"{source}: {_fill_names(cure, source)}")
     if cure := _CURES.get(suffix):
-        return UserError(f"{source}: {_filled(cure, source)}")
-    return UserError(f"{source}: not a format that can be imported ({found}); {formats}")
+        return UserError(f"{source}: {_fill_names(cure, source)}")
+    return UserError(f"{source}: not a format that can be imported ({kind}); {formats}")
 
 
-def unreadable(source: Path, why: str) -> UserError:
+def explain_unreadable(source: Path, reason: str) -> UserError:
     """That a library can't read a source of a known name, with what it found."""
     if source.is_dir():
-        return UserError(f"{source}: can't be read ({why})")
-    suffix, found = source.suffix.lower(), find_format(source)
-    if found == _SAME.get(suffix, suffix):
-        cure = _DAMAGED.get(found, "is it cut off? Copy it again")
-        return UserError(f"{source}: can't be read to its end ({why}); {_filled(cure, source)}")
-    if found.startswith("."):
-        return UserError(f"{source}: is named {suffix}, but is a {found} by its first bytes ({why})")
-    return UserError(f"{source}: can't be read as {suffix} ({why}); {found}")
+        return UserError(f"{source}: can't be read ({reason})")
+    suffix, kind = source.suffix.lower(), find_format(source)
+    if kind == _SAME_FORMAT.get(suffix, suffix):
+        cure = _DAMAGED.get(kind, "is it cut off? Copy it again")
+        return UserError(f"{source}: can't be read to its end ({reason}); {_fill_names(cure, source)}")
+    if kind.startswith("."):
+        return UserError(f"{source}: is named {suffix}, but is a {kind} by its first bytes ({reason})")
+    return UserError(f"{source}: can't be read as {suffix} ({reason}); {kind}")
 
 
 def find_format(source: Path) -> str:
@@ -116,7 +118,7 @@ def find_format(source: Path) -> str:
         return ".avi"
     if head[128:132] == b"DICM":
         return ".dcm"
-    for start, name in _STARTS.items():
+    for start, name in _FIRST_BYTES.items():
         if head.startswith(start):
             return name
     if not head:
@@ -125,5 +127,5 @@ def find_format(source: Path) -> str:
     return f"it begins with {text.decode('latin-1')!a}"
 
 
-def _filled(cure: str, source: Path) -> str:
+def _fill_names(cure: str, source: Path) -> str:
     return cure.format(name=source.name, stem=source.stem)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.importers.importer_registry import MOST_FRAMES, ROLES, Intake, one_of
+from bench.importers.importer_registry import MOST_FRAMES, ROLES, Intake, choose_name
 from synth.errors import UserError
 from synth.system.checked_file import refuse_large
 
@@ -34,30 +34,30 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     file.visititems(
         lambda name, item: arrays.update({name: item}) if isinstance(item, h5py.Dataset) else None
     )
-    chosen = {role: _choose(role, use, arrays) for role in ROLES}
-    frames, times = chosen["frames"], chosen["frame_time"]
+    by_role = {role: _choose(role, use, arrays) for role in ROLES}
+    frames, times = by_role["frames"], by_role["frame_time"]
     if frames is None or times is None:
         missing = "frames" if frames is None else "frame_time"
-        there = ", ".join(sorted(arrays)) or "no arrays"
-        raise UserError(f"{source}: no {missing} found; name them with --use; the file has {there}")
-    for role, array in chosen.items():
+        listing = ", ".join(sorted(arrays)) or "no arrays"
+        raise UserError(f"{source}: no {missing} found; name them with --use; the file has {listing}")
+    for role, array in by_role.items():
         if array is not None:
             _refuse_odd(source, role, array)
     if frames.ndim not in (3, 4) or not all(frames.shape):
         raise UserError(f"{source}: frames of shape {frames.shape}, expected (T, height, width[, channels])")
     refuse_large(frames.shape[2], frames.shape[1])
-    seconds = np.asarray(times[:], np.float64).ravel()
-    if len(seconds) != len(frames):
-        raise UserError(f"{source}: {len(frames)} frames, {len(seconds)} frame times")
-    found = Intake(seconds, lambda: (np.asarray(frames[k]) for k in range(len(frames))))
-    if chosen["force"] is not None:
-        force = np.asarray(chosen["force"][:], np.float64)
+    times_s = np.asarray(times[:], np.float64).ravel()
+    if len(times_s) != len(frames):
+        raise UserError(f"{source}: {len(frames)} frames, {len(times_s)} frame times")
+    intake = Intake(times_s, lambda: (np.asarray(frames[k]) for k in range(len(frames))))
+    if by_role["force"] is not None:
+        force = np.asarray(by_role["force"][:], np.float64)
         if force.ndim != 2 or force.shape[1] not in (3, 6):
             raise UserError(f"{source}: force of shape {force.shape}, expected (N, 3) or (N, 6)")
-        clock = chosen["force_time"]
-        force_s = seconds if clock is None else np.asarray(clock[:], np.float64).ravel()
-        found = replace(found, force_s=force_s, force=force[:, :3])
-    return found
+        clock = by_role["force_time"]
+        force_s = times_s if clock is None else np.asarray(clock[:], np.float64).ravel()
+        intake = replace(intake, force_s=force_s, force=force[:, :3])
+    return intake
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
@@ -74,8 +74,9 @@ def _refuse_odd(source: Path, role: str, array: Any) -> None:
 def _choose(role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:
     """The array for a role: the one named, else the first under a common name; None without."""
     if role in use:
-        return arrays[one_of(role, use[role].strip("/"), sorted(arrays), "array") or ""]
-    by_name = [
-        [name for name in arrays if name.rsplit("/", 1)[-1].lower() == one] for one in _COMMON_NAMES[role]
+        return arrays[choose_name(role, use[role].strip("/"), sorted(arrays), "array") or ""]
+    matches = [
+        [name for name in arrays if name.rsplit("/", 1)[-1].lower() == common_name]
+        for common_name in _COMMON_NAMES[role]
     ]
-    return arrays.get(one_of(role, None, next(filter(None, by_name), []), "array") or "")
+    return arrays.get(choose_name(role, None, next(filter(None, matches), []), "array") or "")

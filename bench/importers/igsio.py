@@ -11,7 +11,7 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from bench.importers.importer_registry import LARGEST_BYTES, MOST_FRAMES, Intake, one_of
+from bench.importers.importer_registry import LARGEST_BYTES, MOST_FRAMES, Intake, choose_name
 from bench.recording.sensor_table import Readings
 from synth.arrays import Floats, Pixels
 from synth.errors import UserError, first_line
@@ -32,7 +32,7 @@ class Header:
     """The text of a sequence."""
 
     source: Path
-    of: dict[str, str]  # fields of the whole
+    fields: dict[str, str]  # fields of the whole
     frames: Fields
     count: int  # of frames
     has_pixels: bool
@@ -52,30 +52,32 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     times = _times(header, use)
     notes: list[str] = []
     force, axes = _force(header, use, notes)
-    if "UltrasoundImageOrientation" in header.of and header.has_pixels:
-        orientation = header.of["UltrasoundImageOrientation"]
+    if "UltrasoundImageOrientation" in header.fields and header.has_pixels:
+        orientation = header.fields["UltrasoundImageOrientation"]
         notes.append(f"orientation {orientation}: pictures are imported as stored")
     film = None
     if header.has_pixels:
-        shown = _good(header, "Image")
-        pictures: Callable[[], Iterator[Pixels]] = _Pixels(header, shown)
+        indices = _find_valid(header, "Image")
+        pictures: Callable[[], Iterator[Pixels]] = _Pixels(header, indices)
     else:
         path = _find_film(header)
         count = video.count_frames(path) or 0
-        shown = _shown(header, path.name, count, notes)
-        pictures = _Film(path, len(shown))
+        indices = _match_film(header, path.name, count, notes)
+        pictures = _Film(path, len(indices))
         film = path if count == header.count else None
-    if len(shown) < header.count:
-        notes.append(f"{header.count - len(shown)} of {header.count} frames have no picture and are left out")
-    poses = {name: rows[shown] for name, rows in _poses(header).items()}
-    good = np.isfinite(force).all(axis=1) & np.isfinite(times) if len(force) else np.zeros(0, bool)
-    if len(force) and (lost := int(header.count - good.sum())):
-        notes.append(f"{lost} of {header.count} frames have no valid force")
+    if len(indices) < header.count:
+        notes.append(
+            f"{header.count - len(indices)} of {header.count} frames have no picture and are left out"
+        )
+    poses = {name: rows[indices] for name, rows in _poses(header).items()}
+    is_valid = np.isfinite(force).all(axis=1) & np.isfinite(times) if len(force) else np.zeros(0, bool)
+    if len(force) and (lost_count := int(header.count - is_valid.sum())):
+        notes.append(f"{lost_count} of {header.count} frames have no valid force")
     return Intake(
-        times[shown],
+        times[indices],
         pictures,
-        times[: len(force)][good],
-        force[good],
+        times[: len(force)][is_valid],
+        force[is_valid],
         tuple(notes),
         axes=axes,
         film=film,
@@ -90,59 +92,60 @@ def read_forces(source: Path) -> Readings:
     force, axes = _force(header, {}, notes)
     if not len(force):
         raise header.error(f"frames have no field Force; there are {_names(header.frames)}")
-    good = np.isfinite(force).all(axis=1) & np.isfinite(times)
-    return Readings(times[good], force[good], axes, False, tuple(notes))
+    is_valid = np.isfinite(force).all(axis=1) & np.isfinite(times)
+    return Readings(times[is_valid], force[is_valid], axes, False, tuple(notes))
 
 
 def read_header(source: Path) -> Header:
     """The fields of a MetaImage. UserError: it is none, has other dimensions, or pictures in another file."""
-    of, frames, where = dict[str, str](), Fields(), ""
+    fields, frames, data_file = dict[str, str](), Fields(), ""
     with checked_file.open_file(source, LARGEST_BYTES) as file:
         while line := file.readline(_LONGEST_LINE):
-            key, mark, value = (part.strip() for part in line.decode("utf-8", "replace").partition("="))
+            key, equals, value = (part.strip() for part in line.decode("utf-8", "replace").partition("="))
             if not line.strip():
                 continue
-            if not mark or len(line) == _LONGEST_LINE:
-                shown = ascii(line[:60].decode("latin-1").strip())
-                raise UserError(f"{source}: no MetaImage: after {len(of)} fields it goes on with {shown}")
+            if not equals or len(line) == _LONGEST_LINE:
+                start = ascii(line[:60].decode("latin-1").strip())
+                raise UserError(f"{source}: no MetaImage: after {len(fields)} fields it goes on with {start}")
             if match := _FIELD.fullmatch(key):
                 frames.setdefault(match[2], {})[int(match[1])] = value
             else:
-                of[key] = value
+                fields[key] = value
             if key == "ElementDataFile":
-                where = value
+                data_file = value
                 break
-    kind = of.get("ElementType", "")
-    has_pixels = kind not in ("", _NO_PIXELS)
-    if has_pixels and where != "LOCAL":
+    element_type = fields.get("ElementType", "")
+    has_pixels = element_type not in ("", _NO_PIXELS)
+    if has_pixels and data_file != "LOCAL":
         raise UserError(
-            f"{source}: its pictures ({kind}) are in another file, {where or 'not named'}, which "
+            f"{source}: its pictures ({element_type}) are in another file, {data_file or 'not named'}, which "
             "is not opened; "
             "save it as one .mha"
         )
-    sizes = [int(word) for word in of.get("DimSize", "").split() if word.isdigit()]
+    sizes = [int(word) for word in fields.get("DimSize", "").split() if word.isdigit()]
     if len(sizes) not in (3, 4) or not 0 < sizes[-1] <= MOST_FRAMES or (len(sizes) == 4 and sizes[2] != 1):
         raise UserError(
-            f"{source}: not a sequence of pictures: ElementType {kind or 'not stated'}, DimSize "
-            f"{of.get('DimSize', 'not stated')}; needed are width, height and at most {MOST_FRAMES} frames"
+            f"{source}: not a sequence of pictures: ElementType {element_type or 'not stated'}, "
+            f"DimSize {fields.get('DimSize', 'not stated')}; needed are width, height and at most "
+            f"{MOST_FRAMES} frames"
         )
-    return Header(source, of, frames, sizes[-1], has_pixels)
+    return Header(source, fields, frames, sizes[-1], has_pixels)
 
 
 class _Pixels:
     """The pictures in a sequence, those of some frames in order."""
 
-    def __init__(self, header: Header, shown: Sequence[int]) -> None:
+    def __init__(self, header: Header, indices: Sequence[int]) -> None:
         """UserError if they can't be read."""
         import SimpleITK
 
-        self._shown = shown
+        self._indices = indices
         self._reader = SimpleITK.ImageFileReader()
         self._reader.SetFileName(str(header.source))
         try:
             self._reader.ReadImageInformation()
         except RuntimeError as error:
-            kind = header.of.get("ElementType")
+            kind = header.fields.get("ElementType")
             raise header.error(
                 f"pictures of ElementType {kind} can't be read ({first_line(error)})"
             ) from None
@@ -154,7 +157,7 @@ class _Pixels:
     def __call__(self) -> Iterator[Pixels]:
         import SimpleITK
 
-        for k in self._shown:
+        for k in self._indices:
             self._reader.SetExtractIndex([0, 0, int(k)])
             self._reader.SetExtractSize([self._size[0], self._size[1], 0])
             yield SimpleITK.GetArrayFromImage(self._reader.Execute())
@@ -173,10 +176,11 @@ class _Film:
 
 def _find_film(header: Header) -> Path:
     """The video that a sequence without pixels names, in its own folder. UserError: there is none."""
-    name = PureWindowsPath(header.of.get("VideoFile", "")).name  # recorders write whole paths of their system
+    # Recorders write whole paths of their system.
+    name = PureWindowsPath(header.fields.get("VideoFile", "")).name
     if not name:
         raise header.error(
-            f"no pictures: ElementType {header.of.get('ElementType', 'not stated')}, and no "
+            f"no pictures: ElementType {header.fields.get('ElementType', 'not stated')}, and no "
             "VideoFile is named"
         )
     folder = header.source.resolve().parent
@@ -188,7 +192,7 @@ def _find_film(header: Header) -> Path:
     return path
 
 
-def _shown(header: Header, film: str, pictures: int, notes: list[str]) -> list[int]:
+def _match_film(header: Header, film: str, pictures: int, notes: list[str]) -> list[int]:
     """The frames that a video of so many pictures shows. UserError: it has many more, or fewer."""
     if abs(pictures - header.count) > _SPARE:
         raise header.error(
@@ -219,7 +223,7 @@ def _force(header: Header, use: dict[str, str], notes: list[str]) -> tuple[Float
     """(T, 3), NaN where a frame has none, and its axes; (0, 3) without a field of force."""
     numbers = [name for name in sorted(header.frames) if not name.endswith(("Status", "Transform"))]
     names = numbers if "force" in use else [name for name in numbers if name.lower() == "force"]
-    name = one_of("force", use.get("force"), names, "field")
+    name = choose_name("force", use.get("force"), names, "field")
     if name is None:
         notes.append(f"no field Force; the frames have {_names(header.frames)}")
         return np.zeros((0, 3)), "xyz"
@@ -232,7 +236,7 @@ def _force(header: Header, use: dict[str, str], notes: list[str]) -> tuple[Float
     return force[:, :3], "xyz"
 
 
-def _good(header: Header, name: str) -> list[int]:
+def _find_valid(header: Header, name: str) -> list[int]:
     """The frames of which something has no status, or another one than INVALID."""
     status = header.frames.get(f"{name}Status", {})
     return [k for k in range(header.count) if status.get(k, "OK").upper() != "INVALID"]
@@ -246,18 +250,18 @@ def _poses(header: Header) -> dict[str, Floats]:
 
 def _column(header: Header, name: str, widths: tuple[int, ...]) -> Floats:
     """(T, width) numbers of a field; NaN where a frame lacks it or its status is INVALID."""
-    good = set(_good(header, name))
-    rows = {k: text.split() for k, text in header.frames[name].items() if k in good}
+    valid = set(_find_valid(header, name))
+    rows = {k: text.split() for k, text in header.frames[name].items() if k in valid}
     width = max((len(row) for row in rows.values()), default=widths[-1])
     if width not in widths:
         expected = " or ".join(map(str, widths))
         raise header.error(f"field {name} holds {width} numbers per frame, expected {expected}")
-    out = np.full((header.count, width), np.nan)
+    columns = np.full((header.count, width), np.nan)
     for k, row in rows.items():
         if len(row) != width:  # a single number would be broadcast
             raise header.error(f"field {name} of frame {k} is not {width} numbers")
         try:
-            out[k] = [float(word) for word in row]
+            columns[k] = [float(word) for word in row]
         except ValueError:
             raise header.error(f"field {name} of frame {k} is not numbers: {' '.join(row)[:60]}") from None
-    return out
+    return columns

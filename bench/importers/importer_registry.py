@@ -91,25 +91,25 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if source.is_dir():
         ending = _folder_ending(source)
     if ending not in IMPORTERS.names():
-        raise file_kinds.unknown(source, sorted(f".{name}" for name in IMPORTERS.names()))
-    place = IMPORTERS.own.get(ending, "")
-    is_bag = place == BAG
-    roles = {BAG: BAG_ROLES, PLAIN: PLAIN_ROLES}.get(place, (*ROLES, "calibration"))
-    if unknown := sorted(set(use) - set(roles)):
-        raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
+        raise file_kinds.explain_unknown(source, sorted(f".{name}" for name in IMPORTERS.names()))
+    reader = IMPORTERS.builtin.get(ending, "")
+    is_bag = reader == BAG
+    roles = {BAG: BAG_ROLES, PLAIN: PLAIN_ROLES}.get(reader, (*ROLES, "calibration"))
+    if unknown_roles := sorted(set(use) - set(roles)):
+        raise UserError(f"--use {unknown_roles[0]}=...: {source.name} has only {', '.join(roles)}")
     calibration = None if is_bag else use.pop("calibration", None)
     with _damage_as_user_error(source):
-        found: Intake = IMPORTERS.load_as_is(ending)(source, use)
-        if not isinstance(found, Intake):
-            raise TypeError(f"{IMPORTERS.label(ending)} returned {type(found).__name__}, expected Intake")
-        _refuse_odd(source, found)
-        right = found.second.pictures() if found.second and found.second.kind == "right" else ()
-        bits, notes = 16, list(found.notes)
-        if (first := next(found.pictures())).dtype.kind == "u" and first.itemsize == 2:
-            bits = video.count_bits(chain(found.pictures(), right))
+        intake: Intake = IMPORTERS.load_as_is(ending)(source, use)
+        if not isinstance(intake, Intake):
+            raise TypeError(f"{IMPORTERS.label(ending)} returned {type(intake).__name__}, expected Intake")
+        _refuse_odd(source, intake)
+        right = intake.second.pictures() if intake.second and intake.second.kind == "right" else ()
+        bits, notes = 16, list(intake.notes)
+        if (picture := next(intake.pictures())).dtype.kind == "u" and picture.itemsize == 2:
+            bits = video.count_bits(chain(intake.pictures(), right))
             notes.append(f"the pictures use {bits} of 16 bits, which are reduced to 8")
 
-    def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[Array]:
+    def decode(view: Intake | SecondView, rgb: bool = True) -> Iterator[Array]:
         with _damage_as_user_error(source):
             size = None
             for k, picture in enumerate(view.pictures()):
@@ -118,24 +118,24 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
                     raise UserError(f"{source}: frame {k} has another size than the frames before it")
                 yield picture
 
-    second = found.second
+    second = intake.second
     if second is not None:
-        second = replace(second, pictures=partial(decoded, second, second.kind == "right"))
-    found = replace(found, pictures=partial(decoded, found), second=second)
-    notes += _describe_force(found)
+        second = replace(second, pictures=partial(decode, second, second.kind == "right"))
+    intake = replace(intake, pictures=partial(decode, intake), second=second)
+    notes += _describe_force(intake)
     if layout is not None:
-        found = _split(found, layout)
+        intake = _split(intake, layout)
     elif second is None and (
-        seems := stereo_layout.find_layout([*islice(found.pictures(), stereo_layout.PICTURES)])
+        guess := stereo_layout.find_layout([*islice(intake.pictures(), stereo_layout.PICTURES)])
     ):
-        cure = f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}"
-        notes.append(stereo_layout.MIXED.get(seems, cure))
+        cure = f"the pictures seem to be of two cameras: import again with --stereo-layout {guess}"
+        notes.append(stereo_layout.MIXED.get(guess, cure))
     if calibration is not None:
-        found = _calibrated(found, Path(calibration))
+        intake = _add_calibration(intake, Path(calibration))
         notes += camera_file.describe(Path(calibration))
-    if found.second is not None and not is_bag and found.second.pair is None:
+    if intake.second is not None and not is_bag and intake.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
-    return replace(found, notes=tuple(notes))
+    return replace(intake, notes=tuple(notes))
 
 
 def _folder_ending(source: Path) -> str:
@@ -148,38 +148,38 @@ def _folder_ending(source: Path) -> str:
     return "npy" if has_pictures and not is_recording else ""
 
 
-def _calibrated(found: Intake, file: Path) -> Intake:
+def _add_calibration(intake: Intake, file: Path) -> Intake:
     """The source with the calibration of its two cameras. UserError: there is one, or the file is of none."""
-    if found.second is None:
+    if intake.second is None:
         raise UserError("--use calibration=...: requires right=... or --stereo-layout")
-    height, width = next(found.pictures()).shape[:2]
+    height, width = next(intake.pictures()).shape[:2]
     rig = read_rig(file, (width, height))
     pair = {"K1": rig.left.K, "D1": rig.left.distortion, "K2": rig.right.K, "D2": rig.right.distortion}
     pair |= {"R": rig.rotation, "T": rig.translation[:, None]}
-    return replace(found, second=replace(found.second, pair=pair))
+    return replace(intake, second=replace(intake.second, pair=pair))
 
 
-def _split(found: Intake, layout: str) -> Intake:
+def _split(intake: Intake, layout: str) -> Intake:
     """Two cameras' pictures that are in one, or follow each other. UserError for no such layout."""
     name, _, order = layout.partition(",")
     if name in stereo_layout.MIXED:
         raise UserError(f"--stereo-layout {layout}: {stereo_layout.MIXED[name]}")
-    if found.second is not None or name not in stereo_layout.LAYOUTS or order not in ("", "right-first"):
+    if intake.second is not None or name not in stereo_layout.LAYOUTS or order not in ("", "right-first"):
         known = ", ".join(stereo_layout.LAYOUTS)
-        why = f"one of {known}, or with ,right-first" if found.second is None else "it has a right camera"
+        why = f"one of {known}, or with ,right-first" if intake.second is None else "it has a right camera"
         raise UserError(f"--stereo-layout {layout}: {why}")
     in_turn, left = name == "alternating", int(bool(order))
-    count = len(found.times_s) // 2 if in_turn else len(found.times_s)
+    count = len(intake.times_s) // 2 if in_turn else len(intake.times_s)
 
-    def view(which: int) -> Iterator[Array]:
+    def view(side: int) -> Iterator[Array]:
         if in_turn:
-            return islice(found.pictures(), which, 2 * count, 2)
-        return (stereo_layout.split(picture, name)[which] for picture in found.pictures())
+            return islice(intake.pictures(), side, 2 * count, 2)
+        return (stereo_layout.split(picture, name)[side] for picture in intake.pictures())
 
-    times = found.times_s[left : 2 * count : 2] if in_turn else found.times_s
+    times = intake.times_s[left : 2 * count : 2] if in_turn else intake.times_s
     second = SecondView("right", np.arange(count), partial(view, 1 - left))
-    poses = {name: rows[left : 2 * count : 2] if in_turn else rows for name, rows in found.poses.items()}
-    return replace(found, times_s=times, pictures=partial(view, left), second=second, film=None, poses=poses)
+    poses = {name: rows[left : 2 * count : 2] if in_turn else rows for name, rows in intake.poses.items()}
+    return replace(intake, times_s=times, pictures=partial(view, left), second=second, film=None, poses=poses)
 
 
 @contextmanager
@@ -192,29 +192,29 @@ def _damage_as_user_error(source: Path) -> Iterator[None]:
     except ImportError as error:
         raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
-        raise file_kinds.unreadable(source, first_line(error)) from error
+        raise file_kinds.explain_unreadable(source, first_line(error)) from error
 
 
-def _refuse_odd(source: Path, found: Intake) -> None:
+def _refuse_odd(source: Path, intake: Intake) -> None:
     """Raises UserError for times that are not seconds, or not as many as the forces."""
-    if len(found.times_s) == 0:
+    if len(intake.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
-    for what, times in (("frame", found.times_s), ("force", found.force_s)):
+    for clock, times in (("frame", intake.times_s), ("force", intake.force_s)):
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         if not (np.abs(times) < _LATEST_S).all() or step >= _LONGEST_STEP_S:
-            raise UserError(f"{source}: {what} times are {step:g} s apart: are they in seconds?")
-    if len(found.force_s) != len(found.force):
-        raise UserError(f"{source}: {len(found.force)} forces, {len(found.force_s)} times for them")
-    if other := clocks.find_other_unit(found.times_s, found.force_s):
+            raise UserError(f"{source}: {clock} times are {step:g} s apart: are they in seconds?")
+    if len(intake.force_s) != len(intake.force):
+        raise UserError(f"{source}: {len(intake.force)} forces, {len(intake.force_s)} times for them")
+    if other := clocks.find_other_unit(intake.times_s, intake.force_s):
         raise UserError(f"{source}: {other}")
 
 
-def _describe_force(found: Intake) -> list[str]:
+def _describe_force(intake: Intake) -> list[str]:
     """Notes on what the force needs: its bias, and a clock that isn't that of the pictures."""
-    if not len(found.force):
+    if not len(intake.force):
         return []
-    notes = [bias] if (bias := find_bias(found.force)) else []
-    sensor_s, frame_s = found.force_s[np.isfinite(found.force_s)], found.times_s
+    notes = [bias] if (bias := find_bias(intake.force)) else []
+    sensor_s, frame_s = intake.force_s[np.isfinite(intake.force_s)], intake.times_s
     if len(sensor_s) and (sensor_s.min() > frame_s.max() or sensor_s.max() < frame_s.min()):
         notes.append(
             f"the sensor's clock ({sensor_s.min():.10g} to {sensor_s.max():.10g} s) isn't that of "
@@ -227,7 +227,7 @@ def _describe_force(found: Intake) -> list[str]:
 
 
 def write_recording(
-    found: Intake,
+    intake: Intake,
     out: Path,
     newtons: float | None,
     about: Mapping[str, object],
@@ -240,7 +240,7 @@ def write_recording(
     number of frames written. Raises UserError if the folder exists, a picture can't be decoded, or the source
     states another unit.
     """
-    if newtons not in (None, 1.0) and found.in_newtons and len(found.force):
+    if newtons not in (None, 1.0) and intake.in_newtons and len(intake.force):
         raise UserError(
             f"--newtons {newtons:g}: the source states its unit, and its forces are newtons "
             "already: leave it out, "
@@ -248,22 +248,22 @@ def write_recording(
         )
     with checked_file.folder_of(out) as part:
         # The container requires rising times; frames.csv has the true ones.
-        steps = np.maximum(np.diff(found.times_s), 1e-3)
-        rising = found.times_s[0] + np.cumsum([0.0, *steps])
-        if found.film is not None:
-            shutil.copyfile(found.film, part / f"video{found.film.suffix.lower()}")
-            progress(len(found.times_s))
+        steps = np.maximum(np.diff(intake.times_s), 1e-3)
+        rising = intake.times_s[0] + np.cumsum([0.0, *steps])
+        if intake.film is not None:
+            shutil.copyfile(intake.film, part / f"video{intake.film.suffix.lower()}")
+            progress(len(intake.times_s))
         else:
             recording_writer.write_video(
-                part / "video.mp4", found.pictures(), rising, crf=0, progress=progress
+                part / "video.mp4", intake.pictures(), rising, crf=0, progress=progress
             )
-        recording_writer.write_frames(part, found.times_s)
-        if len(found.force):
-            recording_writer.write_force(part, found.force_s, (newtons or 1.0) * found.force, found.axes)
-        if found.poses:
-            recording_writer.write_poses(part, found.times_s, found.poses)
+        recording_writer.write_frames(part, intake.times_s)
+        if len(intake.force):
+            recording_writer.write_force(part, intake.force_s, (newtons or 1.0) * intake.force, intake.axes)
+        if intake.poses:
+            recording_writer.write_poses(part, intake.times_s, intake.poses)
         about = dict(about)
-        if (second := found.second) is not None:
+        if (second := intake.second) is not None:
             recording_writer.write_second(part / second.kind, second.frame.tolist(), second.pictures())
             if second.pair is not None:
                 recording_writer.write_storage(part / "stereo.yaml", second.pair)
@@ -274,8 +274,8 @@ def write_recording(
     return out
 
 
-def one_of(
-    role: str, wanted: str | None, names: list[str], what: str, others: Mapping[str, str] | None = None
+def choose_name(
+    role: str, wanted: str | None, names: list[str], noun: str, others: Mapping[str, str] | None = None
 ) -> str | None:
     """The name for a role: the requested one, else the only one, else None. UserError if it is missing, or
     there are several and none is requested. `others`: kinds of what is there but can't be it, by name."""
@@ -286,10 +286,10 @@ def one_of(
                 raise UserError(
                     f"--use {role}={wanted}: is {(others or {})[wanted]}, no {role}; there are {kinds}"
                 )
-            raise UserError(f"--use {role}={wanted}: no such {what}; there are {kinds or 'none'}")
+            raise UserError(f"--use {role}={wanted}: no such {noun}; there are {kinds or 'none'}")
         return wanted
     if len(names) > 1:
-        raise UserError(f"several {what}s could be the {role}: add --use {role}=NAME; {', '.join(names)}")
+        raise UserError(f"several {noun}s could be the {role}: add --use {role}=NAME; {', '.join(names)}")
     return names[0] if names else None
 
 

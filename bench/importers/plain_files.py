@@ -55,22 +55,24 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         raise UserError(f"{source}: pictures without times; add --use frame_time=TABLE.csv or --use fps=RATE")
     second = None
     if "right" in use:
-        other = Path(use["right"])
-        where, names = (other, None) if other.exists() else (source, use["right"])
-        right, own, _ = _open(where, names, use, notes)
-        at = {number: k for k, number in enumerate(numbers)}
-        matched = file_numbers.match_numbers(own, numbers, "right", notes)
-        second = SecondView("right", np.array([at.get(matched[number], -1) for number in own]), right)
+        right_path = Path(use["right"])
+        right_source, pattern = (right_path, None) if right_path.exists() else (source, use["right"])
+        right, right_numbers, _ = _open(right_source, pattern, use, notes)
+        positions = {number: k for k, number in enumerate(numbers)}
+        matches = file_numbers.match_numbers(right_numbers, numbers, "right", notes)
+        second = SecondView(
+            "right", np.array([positions.get(matches[number], -1) for number in right_numbers]), right
+        )
         if (second.frame < 0).all():
             raise UserError(
                 f"--use right={use['right']}: no picture has the number of one of the left camera"
             )
-    found = Intake(times, pictures, notes=tuple(notes), second=second)
+    intake = Intake(times, pictures, notes=tuple(notes), second=second)
     if "force" not in use:
-        return found
+        return intake
     table = _read_forces(Path(use["force"]), use.get("columns", ""), times[0] > SINCE_1970_S, notes)
     return replace(
-        found,
+        intake,
         force_s=table.time_s,
         force=table.force,
         axes=table.axes,
@@ -90,9 +92,9 @@ def _open(
     if source.suffix.lower() in video.SUFFIXES:
         film = _choose_film(source, use)
         times, damaged = [], 0
-        for one in video.read_video(film):
-            times.append(one.time_s)
-            damaged += one.damaged
+        for picture in video.read_video(film):
+            times.append(picture.time_s)
+            damaged += picture.damaged
         if damaged:
             notes.append(
                 f"{source}: {damaged} of {len(times)} pictures are damaged in the file: copy it again"
@@ -106,8 +108,8 @@ def _open(
             )
         return _Film(film), list(range(len(times))), np.array(times, np.float64)
     if source.suffix.lower() in dicom.SUFFIXES:
-        frames_of, count, stated = dicom.open_dicom(source, notes)
-        return frames_of, list(range(count)), stated
+        open_pictures, count, times_s = dicom.open_dicom(source, notes)
+        return open_pictures, list(range(count)), times_s
     if source.suffix.lower() == ".npy":
         frames = np.load(source, mmap_mode="r", allow_pickle=False)
         if frames.ndim not in (3, 4):
@@ -116,7 +118,9 @@ def _open(
     files = {0: source}
     if source.is_dir():
         stills = [
-            p for p in file_numbers.find_stills(source, file_numbers.STILLS) if fnmatch(p.name, names or "*")
+            path
+            for path in file_numbers.find_stills(source, file_numbers.STILLS)
+            if fnmatch(path.name, names or "*")
         ]
         if not stills:
             raise UserError(f"{source}: holds no picture {names}")
@@ -156,7 +160,7 @@ class _Film:
     file: VideoFile
 
     def __call__(self) -> Iterator[Array]:
-        return (one.rgb for one in video.read_video(self.file))
+        return (picture.rgb for picture in video.read_video(self.file))
 
 
 def _choose_film(source: Path, use: Mapping[str, str]) -> VideoFile:
@@ -171,8 +175,14 @@ def _choose_film(source: Path, use: Mapping[str, str]) -> VideoFile:
 
 def films_in(folder: Path, names: str | None = None) -> list[Path]:
     """The videos in a folder, in the order of the numbers in their names, without hidden ones."""
-    films = [p for p in folder.glob("*") if p.suffix.lower() in video.SUFFIXES and not p.name.startswith(".")]
-    return sorted((p for p in films if fnmatch(p.name, names or "*")), key=file_numbers.natural_order)
+    films = [
+        path
+        for path in folder.glob("*")
+        if path.suffix.lower() in video.SUFFIXES and not path.name.startswith(".")
+    ]
+    return sorted(
+        (path for path in films if fnmatch(path.name, names or "*")), key=file_numbers.natural_order
+    )
 
 
 def _open_chapters(
@@ -189,35 +199,40 @@ def _open_chapters(
             "name them by "
             "--use frames=NAME and, for a second camera, right=NAME"
         )
-    times, begun = list[Floats](), list[float | None]()
+    times, dates = list[Floats](), list[float | None]()
     for path in films:
-        own = np.array([one.time_s for one in video.read_video(_choose_film(path, use))], np.float64)
-        if not np.isfinite(own).all() or len(own) < 2:
+        chapter_s = np.array(
+            [picture.time_s for picture in video.read_video(_choose_film(path, use))], np.float64
+        )
+        if not np.isfinite(chapter_s).all() or len(chapter_s) < 2:
             raise UserError(f"{path}: a chapter whose pictures have no times")
-        after, step = 0.0, float(np.median(np.diff(own)))
+        offset_s, step = 0.0, float(np.median(np.diff(chapter_s)))
         if times:
-            after = float(times[-1][-1]) + step
-            begun.append(video.find_date(path))
-            first, now = begun[0], begun[-1]
-            stated = None if first is None or now is None else now - first
-            if stated is not None and stated > after + _GAP_S:
+            offset_s = float(times[-1][-1]) + step
+            dates.append(video.find_date(path))
+            first_date, date = dates[0], dates[-1]
+            stated_s = None if first_date is None or date is None else date - first_date
+            if stated_s is not None and stated_s > offset_s + _GAP_S:
                 notes.append(
-                    f"{path.name}: begins {stated - after:.1f} s after the end of the one before, by its date"
+                    f"{path.name}: begins {stated_s - offset_s:.1f} s after the end of the one before, "
+                    "by its date"
                 )
-                after = stated
+                offset_s = stated_s
         else:
-            begun.append(video.find_date(path))
-        times.append(after + own)
+            dates.append(video.find_date(path))
+        times.append(offset_s + chapter_s)
     if len(films) > 1:
-        ends = ", ".join(f"{path.name} from {own[0]:.2f} s" for path, own in zip(films, times, strict=True))
+        ends = ", ".join(
+            f"{path.name} from {chapter_s[0]:.2f} s" for path, chapter_s in zip(films, times, strict=True)
+        )
         notes.append(f"{len(films)} chapters are joined in order: {ends}")
-    every = np.concatenate(times)
+    all_times = np.concatenate(times)
 
     def pictures() -> Iterator[Array]:
         for path in films:
             yield from _Film(_choose_film(path, use))()
 
-    return pictures, list(range(len(every))), every
+    return pictures, list(range(len(all_times))), all_times
 
 
 def _count_pages(path: Path) -> int:
@@ -233,24 +248,24 @@ def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
     for path, count in pages.items():
         for k in range(0, count, _AT_ONCE):
-            wanted = min(_AT_ONCE, count - k)
-            found = [checked_file.read_picture(path, flags)]
+            batch = min(_AT_ONCE, count - k)
+            pictures = [checked_file.read_picture(path, flags)]
             if count > 1:
-                found = [*cv2.imreadmulti(str(path), start=k, count=wanted, flags=flags)[1]]
-            if len(found) < wanted:
-                raise UserError(f"{path}: page {k + len(found)} of {count} is damaged")
-            yield from (picture[..., ::-1] for picture in found)
+                pictures = [*cv2.imreadmulti(str(path), start=k, count=batch, flags=flags)[1]]
+            if len(pictures) < batch:
+                raise UserError(f"{path}: page {k + len(pictures)} of {count} is damaged")
+            yield from (picture[..., ::-1] for picture in pictures)
 
 
 def _read_forces(path: Path, columns: str, since_1970: bool, notes: list[str]) -> Readings:
     """Samples of a table, or of a PLUS/IGSIO sequence. UserError as `sensor_table.read_forces`."""
     if path.suffix.lower() in igsio.SUFFIXES:
         return igsio.read_forces(path)
-    found = sensor_table.read_forces(path, columns, since_1970)
-    filled = np.isfinite(found.time_s) & np.isfinite(found.force).any(axis=1)
-    if not filled.all():
-        notes.append(f"{path}: {np.sum(~filled)} blank rows are left out")
-    return replace(found, time_s=found.time_s[filled], force=found.force[filled])
+    readings = sensor_table.read_forces(path, columns, since_1970)
+    is_filled = np.isfinite(readings.time_s) & np.isfinite(readings.force).any(axis=1)
+    if not is_filled.all():
+        notes.append(f"{path}: {np.sum(~is_filled)} blank rows are left out")
+    return replace(readings, time_s=readings.time_s[is_filled], force=readings.force[is_filled])
 
 
 def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:

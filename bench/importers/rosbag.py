@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from bench.importers.importer_registry import LARGEST_BYTES, Intake, SecondView, one_of
+from bench.importers.importer_registry import LARGEST_BYTES, Intake, SecondView, choose_name
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file
@@ -43,7 +43,7 @@ _LENSES = ("sensor_msgs/msg/CameraInfo",)
 _TERMS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}  # of distortion, by its model
 _BAYER = ("rggb", "bggr", "gbrg", "grbg")
 _CHANNELS = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, **{f"bayer_{order}": 1 for order in _BAYER}}
-_SAME = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16", "16UC3": "bgr16"}
+_ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16", "16UC3": "bgr16"}
 _YUV = {name: name.upper() for name in ("uyvy", "yuyv", "nv12", "nv21")}  # OpenCV's names
 _YUV |= {"yuv422": "UYVY", "yuv422_yuy2": "YUYV"}
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -69,20 +69,20 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         else:
             parts = _parts(source, notes)
 
-    def opened() -> Any:
+    def open_bag() -> Any:
         return AnyReader(parts, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
-    def pictures(topic: str, read: _Read = _picture) -> Iterator[Array]:
-        with opened() as bag:
-            if read is _picture and _is_packets(bag, topic):
+    def pictures(topic: str, reader: _Read = _picture) -> Iterator[Array]:
+        with open_bag() as bag:
+            if reader is _picture and _is_packets(bag, topic):
                 yield from (picture for _, picture in _decode(bag, topic))
                 return
             for _, message in _messages(bag, topic):
-                yield read(source, message)
+                yield reader(source, message)
 
-    with opened() as bag:
-        second = use.get("right") or use.get("depth")
-        frames = _topic(bag, "frames", _PICTURES, use, second)
+    with open_bag() as bag:
+        second_topic = use.get("right") or use.get("depth")
+        frames = _topic(bag, "frames", _PICTURES, use, second_topic)
         if frames is None:
             raise UserError(f"{source}: holds no topic of pictures; there are {_kinds(bag)}")
         stamps = _stamps(bag, frames, notes)
@@ -90,15 +90,15 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         force = _table(bag, topic, read, 3, notes)
         if topic is None:
             notes.append(f"no topic of forces; there are {_kinds(bag)}")
-        found = Intake(stamps, partial(pictures, frames), force[:, 0], force[:, 1:], tuple(notes))
-        if second is not None:
-            return _add_second(bag, found, frames, use, pictures)
-        if lone := {"calibration", "right_calibration"} & use.keys():
-            raise UserError(f"--use {min(lone)}=...: requires right=TOPIC or depth=TOPIC")
-        return found
+        intake = Intake(stamps, partial(pictures, frames), force[:, 0], force[:, 1:], tuple(notes))
+        if second_topic is not None:
+            return _add_second(bag, intake, frames, use, pictures)
+        if unused := {"calibration", "right_calibration"} & use.keys():
+            raise UserError(f"--use {min(unused)}=...: requires right=TOPIC or depth=TOPIC")
+        return intake
 
 
-def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictures: _Pictures) -> Intake:
+def _add_second(bag: Any, intake: Intake, frames: str, use: dict[str, str], pictures: _Pictures) -> Intake:
     """Adds the right or depth camera; frames before its first picture and after its last are left out.
 
     Calibrations are the topics `calibration` and `right_calibration`, else the pictures' own `camera_info`.
@@ -107,14 +107,14 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     if {"right", "depth"} <= use.keys():
         raise UserError("--use right=... and depth=...: give one of them")
     topic = _topic(bag, kind, _PICTURES, use) or ""
-    notes = list(found.notes)
-    frame = partners(_stamps(bag, topic, notes), found.times_s)
+    notes = list(intake.notes)
+    frame = partners(_stamps(bag, topic, notes), intake.times_s)
     if (frame < 0).all():
         raise UserError(f"{topic}: no picture is at the time of a frame of {frames}")
     first, last = int(frame[frame >= 0].min()), int(frame.max())
-    times = found.times_s[first : last + 1]
-    notes += [f"{topic}: pictures for {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
-    if len(times) < len(found.times_s):
+    times = intake.times_s[first : last + 1]
+    notes += [f"{topic}: pictures for {(frame >= 0).sum()} of {len(intake.times_s)} frames of {frames}"]
+    if len(times) < len(intake.times_s):
         notes.append(f"frames before {first} and after {last} have none and are left out")
     left = _lens(bag, frames, use.get("calibration"), next(pictures(frames)))
     view = SecondView(kind, np.where(frame < 0, -1, frame - first), partial(pictures, topic))
@@ -125,15 +125,15 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
         view = replace(view, pictures=partial(pictures, topic, _depth))
         if left is not None:
             notes.append(f"{topic} is assumed to be registered to {frames}, pixel by pixel")
-            about = {"focal_px": float(left.K[0, 0]), "centre_px": left.K[:2, 2].tolist()}
-            view = replace(view, lens=about)
+            lens = {"focal_px": float(left.K[0, 0]), "centre_px": left.K[:2, 2].tolist()}
+            view = replace(view, lens=lens)
             if left.distortion.any():
                 notes.append(f"the distortion of {frames} is ignored for depth")
     if view.pair is None and view.lens is None:
         section = {"right": "stereo", "depth": "depth"}[kind]
         notes.append(f"no calibration found (camera_info): add {section} to meta.yaml")
     return replace(
-        found,
+        intake,
         times_s=times,
         pictures=lambda: islice(pictures(frames), first, last + 1),
         notes=tuple(notes),
@@ -144,18 +144,18 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
 def partners(times_s: Floats, frames_s: Floats) -> Ints:
     """The frame (T,) of each picture (M,) of another camera: mutually nearest in time [s] and at most half a
     frame interval away; -1: none."""
-    apart, frame = KDTree(frames_s[:, None]).query(times_s[:, None])
+    distance_s, frame = KDTree(frames_s[:, None]).query(times_s[:, None])
     picture = KDTree(times_s[:, None]).query(frames_s[:, None])[1]
     step = float(np.median(np.diff(np.sort(frames_s)))) if len(frames_s) > 1 else np.inf
-    return np.where((picture[frame] == np.arange(len(times_s))) & (apart <= step / 2), frame, -1)
+    return np.where((picture[frame] == np.arange(len(times_s))) & (distance_s <= step / 2), frame, -1)
 
 
-def _lens(bag: Any, pictures: str, named: str | None, picture: Array) -> _Lens | None:
+def _lens(bag: Any, pictures: str, requested: str | None, picture: Array) -> _Lens | None:
     names = sorted({c.topic for c in bag.connections if c.msgtype in _LENSES})
-    usual = _info_name(pictures)
-    if not named and usual not in names:
+    usual_topic = _info_name(pictures)
+    if not requested and usual_topic not in names:
         return None
-    topic = one_of("calibration", named or usual, names, "topic") or usual
+    topic = choose_name("calibration", requested or usual_topic, names, "topic") or usual_topic
     _, info = next(_messages(bag, topic))
     return _read_lens(topic, info, pictures, (picture.shape[1], picture.shape[0]))
 
@@ -170,17 +170,17 @@ def _refuse_elsewhere(folder: Path) -> None:
         raise UserError(f"{path}: relative_file_paths is missing")
     for name in names:
         if not isinstance(name, str) or name != Path(name).name:
-            shown = name[:80] if isinstance(name, str) else "a file"  # other YAML may be endless
-            raise UserError(f"{path}: {shown} is not in the bag's folder")
+            label = name[:80] if isinstance(name, str) else "a file"  # other YAML may be endless
+            raise UserError(f"{path}: {label} is not in the bag's folder")
         checked_file.check_file(folder / name, LARGEST_BYTES)
 
 
 def _topic(
-    bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str], taken: str | None = None
+    bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str], excluded: str | None = None
 ) -> str | None:
-    names = sorted({c.topic for c in bag.connections if c.msgtype in kinds} - {taken})
+    names = sorted({c.topic for c in bag.connections if c.msgtype in kinds} - {excluded})
     others = {c.topic: c.msgtype for c in bag.connections if c.topic not in names}
-    return one_of(role, use.get(role), names, "topic", others)
+    return choose_name(role, use.get(role), names, "topic", others)
 
 
 def _parts(folder: Path, notes: list[str]) -> list[Path]:
@@ -221,15 +221,15 @@ def _force_topic(
             if path is not None and (path[-1:] != (_ARRAY,) or wanted is not None):
                 paths[connection.topic] = path
     others = {c.topic: c.msgtype for c in bag.connections if c.topic not in paths}
-    topic = one_of("force", wanted, sorted(paths), "topic", others)
+    topic = choose_name("force", wanted, sorted(paths), "topic", others)
     if topic is None:
         return None, _vector
     path = paths[topic]
     if path[-1:] == (_ARRAY,):
         notes.append(f"{topic}: the first three numbers of {'.'.join(path[:-1])} are taken for fx, fy, fz")
-        return topic, lambda message: tuple(float(x) for x in _inside(message, path[:-1])[:3])
+        return topic, lambda message: tuple(float(x) for x in _follow_path(message, path[:-1])[:3])
     notes.append(f"{topic}: the force is its {'.'.join(path)}")
-    return topic, lambda message: _vector(_inside(message, path))
+    return topic, lambda message: _vector(_follow_path(message, path))
 
 
 _ARRAY = "[]"  # the end of a path to an array of numbers
@@ -238,7 +238,7 @@ _ARRAY = "[]"  # the end of a path to an array of numbers
 def _find_vector(message: Any, depth: int = 4) -> tuple[str, ...] | None:
     """Names of the fields that lead to the only force in a message, or to an array of 3 or 6; None: there is
     none, or several."""
-    found, arrays = list[tuple[str, ...]](), list[tuple[str, ...]]()
+    forces, arrays = list[tuple[str, ...]](), list[tuple[str, ...]]()
 
     def search(part: Any, path: tuple[str, ...]) -> None:
         for name in getattr(part, "__dataclass_fields__", ()) if len(path) < depth else ():
@@ -246,18 +246,18 @@ def _find_vector(message: Any, depth: int = 4) -> tuple[str, ...] | None:
             if name == "__msgtype__" or "covariance" in name:
                 continue
             if name == "force" and all(hasattr(value, axis) for axis in "xyz"):
-                found.append((*path, name))
+                forces.append((*path, name))
             elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.size in (3, 6):
                 arrays.append((*path, name, _ARRAY))
             else:
                 search(value, (*path, name))
 
     search(message, ())
-    chosen = found or arrays
-    return chosen[0] if len(chosen) == 1 else None
+    paths = forces or arrays
+    return paths[0] if len(paths) == 1 else None
 
 
-def _inside(message: Any, path: tuple[str, ...]) -> Any:
+def _follow_path(message: Any, path: tuple[str, ...]) -> Any:
     for name in path:
         message = getattr(message, name)
     return message
@@ -301,21 +301,21 @@ def _stamps(bag: Any, topic: str, notes: list[str]) -> Floats:
     stamps = _table(bag, topic, lambda message: (), 0, notes)[:, 0]
     if not _is_packets(bag, topic):
         return stamps
-    shown = [k for k, _ in _decode(bag, topic)]
-    if len(shown) < len(stamps):
-        lost = len(stamps) - len(shown)
+    indices = [k for k, _ in _decode(bag, topic)]
+    if len(indices) < len(stamps):
+        lost = len(stamps) - len(indices)
         notes.append(
             f"{topic}: {lost} of {len(stamps)} packets give no picture, as before the first key frame"
         )
-    return stamps[shown]
+    return stamps[indices]
 
 
 def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
     """Time on the bag's clock [s] and message, in the bag's order; none without a topic."""
-    chosen = [c for c in bag.connections if c.topic == topic]
-    if not chosen:  # with an empty list rosbags would yield every message
+    connections = [c for c in bag.connections if c.topic == topic]
+    if not connections:  # with an empty list rosbags would yield every message
         return
-    for connection, logged, raw in bag.messages(chosen):
+    for connection, logged, raw in bag.messages(connections):
         yield 1e-9 * logged, bag.deserialize(raw, connection.msgtype)
 
 
@@ -345,24 +345,24 @@ def _picture(source: Path, message: Any) -> Array:
     """RGB[A] or grey, of 8 or 16 bits."""
     if hasattr(message, "format"):
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
-        found = checked_file.decode_picture(bytes(message.data), flags)[..., ::-1]
+        image = checked_file.decode_picture(bytes(message.data), flags)[..., ::-1]
         colour = message.format.split(";")[0].strip().rstrip("0168")
-        is_mosaic = colour.startswith("bayer_") and (found == found[..., :1]).all()
-        return _demosaic(np.ascontiguousarray(found[..., 0]), colour) if is_mosaic else found
+        is_mosaic = colour.startswith("bayer_") and (image == image[..., :1]).all()
+        return _demosaic(np.ascontiguousarray(image[..., 0]), colour) if is_mosaic else image
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(-1, message.step)
     if (order := _YUV.get(message.encoding)) is not None:
         packed = rows[:, : message.width * (1 if order.startswith("NV") else 2)]
         packed = packed if order.startswith("NV") else packed.reshape(message.height, message.width, 2)
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(packed), getattr(cv2, f"COLOR_YUV2RGB_{order}")))
-    encoding = _SAME.get(message.encoding, message.encoding)
+    encoding = _ENCODINGS.get(message.encoding, message.encoding)
     colour = encoding.rstrip("0168")
     channels, bits = _CHANNELS.get(colour), encoding[len(colour) :]
     if channels is None or bits not in ("8", "16"):
         known = ", ".join([*_CHANNELS, *_YUV])
         raise UserError(f"{source}: picture encoding {message.encoding}; supported: {known}, 8 or 16 bits")
     kind = np.dtype((">" if message.is_bigendian else "<") + f"u{int(bits) // 8}")
-    used = np.ascontiguousarray(rows[:, : message.width * channels * kind.itemsize]).view(kind)
-    picture = used.astype(kind.newbyteorder("=")).reshape(message.height, message.width, channels)
+    values = np.ascontiguousarray(rows[:, : message.width * channels * kind.itemsize]).view(kind)
+    picture = values.astype(kind.newbyteorder("=")).reshape(message.height, message.width, channels)
     if colour.startswith("bayer_"):
         return _demosaic(picture[..., 0], colour)
     return picture[..., [2, 1, 0]] if colour.startswith("bgr") else picture  # without opacity
@@ -380,16 +380,16 @@ def _depth(source: Path, message: Any) -> Array:
         if "compressedDepth" in message.format and message.format.startswith("32FC1"):
             raise UserError(f"{source}: inverse depth ({message.format}) is not supported; decompress it")
         data = bytes(message.data)[_HEADER * ("compressedDepth" in message.format) :]
-        found = checked_file.decode_picture(data, cv2.IMREAD_UNCHANGED)
-        if found.dtype != np.uint16 or found.ndim != 2:
+        depth = checked_file.decode_picture(data, cv2.IMREAD_UNCHANGED)
+        if depth.dtype != np.uint16 or depth.ndim != 2:
             raise UserError(f"{source}: depth in {message.format} is not 16-bit")
-        return found
+        return depth
     if message.encoding not in _DEPTHS:
         raise UserError(f"{source}: depth encoding {message.encoding}; supported: {', '.join(_DEPTHS)}")
     kind = np.dtype((">" if message.is_bigendian else "<") + _DEPTHS[message.encoding])
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    found = np.ascontiguousarray(rows[:, : message.width * kind.itemsize]).view(kind)
-    return 1000 * found.astype(np.float32) if kind.kind == "f" else found.astype(np.uint16)
+    depth = np.ascontiguousarray(rows[:, : message.width * kind.itemsize]).view(kind)
+    return 1000 * depth.astype(np.float32) if kind.kind == "f" else depth.astype(np.uint16)
 
 
 @dataclass(frozen=True)
@@ -406,12 +406,12 @@ def _read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> _
     """The camera of a calibration message of ROS 1 or 2, for a topic of pictures of width and height `size`;
     those named `image_rect...` are rectified. UserError for no calibration, or one for another size."""
     K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
-    corner, binned, shown = _region(info)
-    if (shown != size).any():
-        calibrated = f"{info.width} x {info.height}"
-        if tuple(shown) != (info.width, info.height):
-            calibrated += f", its region (roi) and binning give {shown[0]} x {shown[1]}"
-        raise UserError(f"{topic}: calibrated at {calibrated} px, but {pictures} has {size[0]} x {size[1]}")
+    corner, binned, region_size = _region(info)
+    if (region_size != size).any():
+        size_text = f"{info.width} x {info.height}"
+        if tuple(region_size) != (info.width, info.height):
+            size_text += f", its region (roi) and binning give {region_size[0]} x {region_size[1]}"
+        raise UserError(f"{topic}: calibrated at {size_text} px, but {pictures} has {size[0]} x {size[1]}")
     K, P = K.reshape(3, 3), P.reshape(3, 4)
     if not (np.isfinite([*K.flat, *P.flat]).all() and min(K[0, 0], K[1, 1], P[0, 0], P[1, 1]) > 0):
         raise UserError(f"{topic}: the camera isn't calibrated (K or P is 0)")
@@ -431,12 +431,12 @@ def _region(info: Any) -> tuple[Floats, Floats, Ints]:
     Width and height of the message are the whole sensor's; 0 stands for all of it, and for no binning.
     """
     binning = [max(int(getattr(info, name, 0)), 1) for name in ("binning_x", "binning_y")]
-    area, whole = getattr(info, "roi", None), (int(info.width), int(info.height))
-    corner, part = (0, 0), whole
-    if area is not None and area.width and area.height:
-        corner, part = (int(area.x_offset), int(area.y_offset)), (int(area.width), int(area.height))
+    roi, full_size = getattr(info, "roi", None), (int(info.width), int(info.height))
+    corner, size = (0, 0), full_size
+    if roi is not None and roi.width and roi.height:
+        corner, size = (int(roi.x_offset), int(roi.y_offset)), (int(roi.width), int(roi.height))
     binned = np.array(binning, np.float64)
-    return np.array(corner, np.float64), binned, np.array(part) // np.array(binning)
+    return np.array(corner, np.float64), binned, np.array(size) // np.array(binning)
 
 
 def _image_name(topic: str) -> str:

@@ -16,7 +16,7 @@ FUSION = "network and physics"
 def simpler_methods() -> dict[str, Method]:
     """Physics and the plug-ins of installed packages. UserError if one has the name of a method of ours."""
     methods: dict[str, Method] = {PHYSICS: Physics()}
-    others = method_plugins.list_installed()
-    if taken := {FUSION, MAIN, *methods} & set(others):
-        raise UserError(f"method {min(taken)}: this name is reserved; rename the plug-in's method")
-    return methods | others
+    plug_ins = method_plugins.list_installed()
+    if reserved := {FUSION, MAIN, *methods} & set(plug_ins):
+        raise UserError(f"method {min(reserved)}: this name is reserved; rename the plug-in's method")
+    return methods | plug_ins

@@ -108,11 +108,11 @@ def solve(tissue: TissueKind, components: int, *, alone: bool = False) -> Floats
     """
     block: Block = "free" if tissue.edge == "free" else "held"
     geometry, rows = _geometry(block), components * len(lattice().points)
-    held = _hold_alone(geometry, tissue) if alone else _hold(_condense(block, tissue.poisson), tissue)
-    root = cholesky(held, lower=True, overwrite_a=True, check_finite=False)
-    moved = dtrsm(1.0, root, geometry.loads, lower=1)
-    moved = dtrsm(1.0, root, moved, lower=1, trans_a=1, overwrite_b=1)
-    return np.asarray(geometry.observed[:rows] @ moved, np.float64)
+    stiffness = _hold_alone(geometry, tissue) if alone else _hold(_condense(block, tissue.poisson), tissue)
+    root = cholesky(stiffness, lower=True, overwrite_a=True, check_finite=False)
+    motion = dtrsm(1.0, root, geometry.loads, lower=1)
+    motion = dtrsm(1.0, root, motion, lower=1, trans_a=1, overwrite_b=1)
+    return np.asarray(geometry.observed[:rows] @ motion, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +150,16 @@ class _Surface:
     """
 
     geometry: _Geometry
-    rest: NDArray[np.float32]  # (3 R, 3 R) mN/mm, of the nodes around the window
-    across: NDArray[np.float32]  # (3 R, 3 W) from the window to them
+    outer: NDArray[np.float32]  # (3 R, 3 R) mN/mm, of the nodes around the window
+    coupling: NDArray[np.float32]  # (3 R, 3 W) from the window to them
     window: Floats  # (3 W, 3 W)
 
 
 def _hold(surface: _Surface, tissue: TissueKind) -> Floats:
     """The stiffness (3 W, 3 W) of the window under skull and membrane; only the lower triangle is right."""
     rows = degrees_of_freedom(surface.geometry.nodes)
-    added = surface.geometry.assemble_added(tissue)[rows][:, rows]
-    rest, within = slice(len(surface.rest)), slice(len(surface.rest), None)
+    added_stiffness = surface.geometry.assemble_added(tissue)[rows][:, rows]
+    outer, inner = slice(len(surface.outer)), slice(len(surface.outer), None)
 
     def add(dense: NDArray[np.floating], part: sp.csr_array) -> NDArray[np.floating]:
         total, sparse = dense.copy(order="F"), sp.coo_array(part)
@@ -168,11 +168,13 @@ def _hold(surface: _Surface, tissue: TissueKind) -> Floats:
 
     # What surrounds the window is eliminated in single precision, at half the cost and with errors of 1e-6.
     # All are symmetric or of one triangle, in Fortran's order: BLAS copies and mirrors nothing.
-    root = cholesky(add(surface.rest, added[rest, rest]), lower=True, overwrite_a=True, check_finite=False)
-    taken = strsm(1.0, root, add(surface.across, added[rest, within]), lower=1, overwrite_b=1)
-    held = add(surface.window, added[within, within])
-    held -= ssyrk(1.0, taken, trans=1, lower=1)
-    return np.asarray(held, np.float64)
+    root = cholesky(
+        add(surface.outer, added_stiffness[outer, outer]), lower=True, overwrite_a=True, check_finite=False
+    )
+    coupling = strsm(1.0, root, add(surface.coupling, added_stiffness[outer, inner]), lower=1, overwrite_b=1)
+    window = add(surface.window, added_stiffness[inner, inner])
+    window -= ssyrk(1.0, coupling, trans=1, lower=1)
+    return np.asarray(window, np.float64)
 
 
 def _hold_alone(geometry: _Geometry, tissue: TissueKind) -> Floats:
@@ -190,23 +192,28 @@ def _condense(block: Block, poisson: float) -> _Surface:
     geometry = _geometry(block)
     volume = next(iter(geometry.volumes.values()))
     tissue = geometry.assemble_tissue(poisson)
-    whole = condense(tissue, volume.points, volume.cells, geometry.nodes, volume.fixed).T
-    rest, within = slice(len(whole) - len(geometry.loads)), slice(len(whole) - len(geometry.loads), None)
-    around, across = (np.asfortranarray(whole[rest, part], np.float32) for part in (rest, within))
-    return _Surface(geometry, around, across, np.asfortranarray(whole[within, within]))
+    stiffness = condense(tissue, volume.points, volume.cells, geometry.nodes, volume.fixed).T
+    outer, inner = (
+        slice(len(stiffness) - len(geometry.loads)),
+        slice(len(stiffness) - len(geometry.loads), None),
+    )
+    outer_part, coupling = (np.asfortranarray(stiffness[outer, part], np.float32) for part in (outer, inner))
+    return _Surface(geometry, outer_part, coupling, np.asfortranarray(stiffness[inner, inner]))
 
 
 @lru_cache(maxsize=1)
 def _geometry(block: Block) -> _Geometry:
     edges: tuple[Edge, ...] = ("free",) if block == "free" else ("bonded", "slipping")
-    volumes, where = {edge: _mesh(_TETS, edge) for edge in edges}, lattice()
+    volumes, grid = {edge: _mesh(_TETS, edge) for edge in edges}, lattice()
     volume = volumes[edges[0]]
-    embedded = [_embed(volume, xy) for xy in (where.points, where.nodes)]
-    moving = [np.union1d(each.value.indices, each.spin.indices // 3) for each in embedded]
-    window = np.union1d(*moving)
+    embeddings = [_embed(volume, xy) for xy in (grid.points, grid.nodes)]
+    moving_nodes = [
+        np.union1d(embedding.value.indices, embedding.spin.indices // 3) for embedding in embeddings
+    ]
+    window = np.union1d(*moving_nodes)
     surface = np.setdiff1d(tetrahedra.boundary(volume.cells), window)
     nodes = np.concatenate([surface[~volume.fixed[surface]], window])
-    observed, loads = (_motion(each, window) for each in embedded)
+    observed, loads = (_motion(embedding, window) for embedding in embeddings)
     return _Geometry(volumes, nodes, observed, loads.T)  # in Fortran's order
 
 
@@ -216,11 +223,11 @@ def _motion(embedding: Embedding, window: Ints) -> Floats:
     It is `Embedding.move` of unit motions of the window's nodes.
     """
     count = embedding.value.shape[0]
-    moved = np.kron(embedding.value[:, window].toarray(), np.eye(3)).reshape(count, 3, -1)
+    motion = np.kron(embedding.value[:, window].toarray(), np.eye(3)).reshape(count, 3, -1)
     spin = embedding.spin[:, degrees_of_freedom(window)].toarray()
-    turned = embedding.corner @ embedding.mean @ spin.reshape(len(embedding.mean), -1)
-    moved += np.cross(turned.reshape(moved.shape), embedding.arm[:, :, None], axis=1)
-    return np.asarray(np.einsum("ab,vbw->avw", TO_CAMERA, moved).reshape(3 * count, -1), np.float64)
+    rotation = embedding.corner @ embedding.mean @ spin.reshape(len(embedding.mean), -1)
+    motion += np.cross(rotation.reshape(motion.shape), embedding.arm[:, :, None], axis=1)
+    return np.asarray(np.einsum("ab,vbw->avw", TO_CAMERA, motion).reshape(3 * count, -1), np.float64)
 
 
 def _mesh(tets: int, edge: Edge) -> Tets:

@@ -45,29 +45,29 @@ class Fusion:
 
         `known_mn`: (T,) where it is known (free spans, press), else NaN: what fails there loses weight.
         """
-        known = np.full(len(estimates), np.nan) if known_mn is None else known_mn
-        cautions = [_widening([frame[name] for frame in estimates], known) for name in self.parts]
-        fused, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
+        reference_mn = np.full(len(estimates), np.nan) if known_mn is None else known_mn
+        factors = [_find_widening([frame[name] for frame in estimates], reference_mn) for name in self.parts]
+        fusions, weighted_squares, squares, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in estimates:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
-                fused.append(ForceEstimate(network.force_mn))
+                fusions.append(ForceEstimate(network.force_mn))
                 self._alone += 1
                 continue
-            spread = (_CAUTION[cameras] * cautions[0]) ** 2 * network.likely.covariance[0]
-            prior = replace(physics.likely, covariance=cautions[1] ** 2 * physics.likely.covariance)
-            both = prior.observe(network.likely.mean, spread)
-            off = network.force_mn - physics.force_mn
-            square = float(off @ off)
+            covariance = (_CAUTION[cameras] * factors[0]) ** 2 * network.likely.covariance[0]
+            prior = replace(physics.likely, covariance=factors[1] ** 2 * physics.likely.covariance)
+            posterior = prior.observe(network.likely.mean, covariance)
+            difference = network.force_mn - physics.force_mn
+            square = float(difference @ difference)
             # The weight is in 0..1: components that lose weight must not move the estimate beyond both.
-            share = float((both.mean - physics.force_mn) @ off) / max(square, 1e-12)
+            share = float((posterior.mean - physics.force_mn) @ difference) / max(square, 1e-12)
             weight = min(max(share, 0.0), 1.0)
-            mean = both.mean + (weight - share) * off
+            mean = posterior.mean + (weight - share) * difference
             # What neither sees stays as likely as physics has it, however sure the network is.
-            fused.append(ForceEstimate(mean, expected_mn=prior.centred(mean).find_size(cameras)))
-            pulled, apart = pulled + weight * square, apart + square
-        self._share = pulled / apart if apart else 0.0
-        return fused
+            fusions.append(ForceEstimate(mean, expected_mn=prior.centre_at(mean).find_size(cameras)))
+            weighted_squares, squares = weighted_squares + weight * square, squares + square
+        self._share = weighted_squares / squares if squares else 0.0
+        return fusions
 
     @property
     def notes(self) -> list[str]:
@@ -78,19 +78,19 @@ class Fusion:
     @property
     def warnings(self) -> list[str]:
         """Frames without a fusion."""
-        alone = f"{self._alone} frames use {self.parts[0]} alone: one of the two methods states no error"
-        return [alone] if self._alone else []
+        message = f"{self._alone} frames use {self.parts[0]} alone: one of the two methods states no error"
+        return [message] if self._alone else []
 
 
-def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:
+def _find_widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:
     """Factor of at least 1 by which a method's 90% intervals hold 90% of the known forces (T,) [mN]."""
-    needed = []
-    for estimate, true in zip(estimates, known_mn, strict=True):
-        side = (
+    factors = []
+    for estimate, true_mn in zip(estimates, known_mn, strict=True):
+        side_mn = (
             estimate.high_mn - estimate.size_mn
-            if true > estimate.size_mn
+            if true_mn > estimate.size_mn
             else estimate.size_mn - estimate.low_mn
         )
-        if np.isfinite(true) and np.isfinite(side):
-            needed.append(abs(true - estimate.size_mn) / max(side, 1e-9))
-    return float(np.clip(np.quantile(needed, 0.9), 1, _MOST)) if needed else 1.0
+        if np.isfinite(true_mn) and np.isfinite(side_mn):
+            factors.append(abs(true_mn - estimate.size_mn) / max(side_mn, 1e-9))
+    return float(np.clip(np.quantile(factors, 0.9), 1, _MOST)) if factors else 1.0

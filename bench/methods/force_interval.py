@@ -119,8 +119,8 @@ class IntervalTable:
         `recovered_by`: estimator of the motion and its version, empty if not known.
         """
         if recovered_by != self.flow:
-            by = recovered_by or "another"
-            return f"no interval: it is calibrated for motion by {self.flow}, and this is by {by}"
+            estimator = recovered_by or "another"
+            return f"no interval: it is calibrated for motion by {self.flow}, and this is by {estimator}"
         if gaps := self.find_gaps(video):
             return f"no interval: beyond the recordings that it is calibrated on in {' and '.join(gaps)}"
         return ""
@@ -170,29 +170,29 @@ def gather(
 
 def describe(video: VideoEstimates) -> Floats:
     """Features (T, F) of a video's frames, in the order of `NAMES`."""
-    size, most = video.size_mn, max(video.largest_mn, 1e-9)
-    whole = max(_rms(size), 1e-9)
-    moves = np.ptp(video.motion_mm) > 0 and np.ptp(size) > 0
-    r = float(np.corrcoef(video.motion_mm, size)[0, 1]) if moves else 0.0
+    size, largest_mn = video.size_mn, max(video.largest_mn, 1e-9)
+    overall_mn = max(_rms(size), 1e-9)
+    is_moving = np.ptp(video.motion_mm) > 0 and np.ptp(size) > 0
+    r = float(np.corrcoef(video.motion_mm, size)[0, 1]) if is_moving else 0.0
     of_video = (
-        np.log(_rms(video.spread_mn) / whole + _SPREAD),
+        np.log(_rms(video.spread_mn) / overall_mn + _SPREAD),
         np.log(1 + _SHAPE - r),
         np.log(float(np.quantile(video.motion_mm, _LARGEST)) + _MOTION_MM),
         video.stated,
     )
     columns = (
-        np.log(size / most + _SIZE),
-        np.log(video.spread_mn / most + _SPREAD),
+        np.log(size / largest_mn + _SIZE),
+        np.log(video.spread_mn / largest_mn + _SPREAD),
         *(np.full(len(size), value) for value in of_video),
     )
     return np.stack(columns, axis=1)
 
 
-def find_spread(likely: ForceMixture) -> float:
+def find_spread(mixture: ForceMixture) -> float:
     """Standard deviation of a distribution of force: root of the trace of its covariance."""
-    off = likely.force - likely.mean
-    within = np.trace(likely.covariance, axis1=1, axis2=2)
-    return float(np.sqrt(likely.weight @ (within + np.square(off).sum(axis=1))))
+    deviation = mixture.force - mixture.mean
+    within = np.trace(mixture.covariance, axis1=1, axis2=2)
+    return float(np.sqrt(mixture.weight @ (within + np.square(deviation).sum(axis=1))))
 
 
 def _rms(values: Floats) -> float:

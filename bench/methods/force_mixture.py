@@ -34,9 +34,9 @@ class ForceMixture:
         """Forces (N, 3) of the distribution, always the same."""
         weight = self.weight / self.weight.sum()
         # The sum may round to less than the last draw's place.
-        drawn = np.searchsorted(np.cumsum(weight)[:-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
+        indices = np.searchsorted(np.cumsum(weight)[:-1], (np.arange(_DRAWS) + 0.5) / _DRAWS)
         root = np.linalg.cholesky(self.covariance + 1e-12 * np.eye(3))
-        return np.asarray(self.force[drawn] + np.einsum("nab,nb->na", root[drawn], _normals()[0]))
+        return np.asarray(self.force[indices] + np.einsum("nab,nb->na", root[indices], _normals()[0]))
 
     @property
     def mean_size(self) -> float:
@@ -48,38 +48,40 @@ class ForceMixture:
         show and the mean force is without it; with two that of the mean, to which noise does not add."""
         return self.mean_size if cameras == 1 else float(np.linalg.norm(self.mean))
 
-    def centred(self, mean: Floats) -> ForceMixture:
+    def centre_at(self, mean: Floats) -> ForceMixture:
         """The distribution moved so that its mean is `mean` (3,)."""
         return replace(self, force=self.force + (mean - self.mean))
 
-    def times(self, factor: float) -> ForceMixture:
+    def scale_by(self, factor: float) -> ForceMixture:
         """The distribution of forces `factor` times as large."""
         return replace(self, force=factor * self.force, covariance=factor**2 * self.covariance)
 
-    def within(self, world: int) -> ForceMixture:
+    def condition_on(self, world: int) -> ForceMixture:
         """The distribution under one assumption on the tissue."""
-        of = self.world == world
-        weight = np.maximum(self.weight[of], 1e-300)
-        return ForceMixture(weight / weight.sum(), self.force[of], self.covariance[of])
+        component = self.world == world
+        weight = np.maximum(self.weight[component], 1e-300)
+        return ForceMixture(weight / weight.sum(), self.force[component], self.covariance[component])
 
     def with_gain(self, gain: float) -> ForceMixture:
         """The distribution with a further relative standard deviation `gain` of every force."""
-        along = np.einsum("ma,mb->mab", self.force, self.force)
-        return replace(self, covariance=self.covariance + gain**2 * along)
+        outer = np.einsum("ma,mb->mab", self.force, self.force)
+        return replace(self, covariance=self.covariance + gain**2 * outer)
 
     def observe(self, force: Floats, covariance: Floats) -> ForceMixture:
         """The posterior after an independent estimate `force` (3,) with error `covariance` (3, 3).
 
         A product of Gaussians (Bishop, Pattern Recognition and Machine Learning, 2006, section 2.3).
         """
-        both, off = self.covariance + covariance, force - self.force
-        pull = np.linalg.solve(both, off[..., None])[..., 0]
-        log = np.log(self.weight) - 0.5 * ((off * pull).sum(axis=1) + np.linalg.slogdet(both)[1])
+        total, difference = self.covariance + covariance, force - self.force
+        correction = np.linalg.solve(total, difference[..., None])[..., 0]
+        log = np.log(self.weight) - 0.5 * (
+            (difference * correction).sum(axis=1) + np.linalg.slogdet(total)[1]
+        )
         return replace(
             self,
             weight=softmax(log),
-            force=self.force + np.einsum("mab,mb->ma", self.covariance, pull),
-            covariance=self.covariance - self.covariance @ np.linalg.solve(both, self.covariance),
+            force=self.force + np.einsum("mab,mb->ma", self.covariance, correction),
+            covariance=self.covariance - self.covariance @ np.linalg.solve(total, self.covariance),
         )
 
 
@@ -102,7 +104,7 @@ def size_interval(force: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
     """
     if force.world is not None and len(worlds := np.unique(force.world)) > 1:
         size = force.find_size(cameras)
-        ends = [size_interval(force.within(world), gain, cameras) for world in worlds]
+        ends = [size_interval(force.condition_on(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
     size, forces = force.find_size(cameras), force.draws
     sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * _normals()[1])

@@ -61,7 +61,7 @@ class SeenMotion:
     slope: float  # largest slope, mm per mm
 
 
-def seen_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion:
+def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion:
     """Motion on a grid, by means over neighbours that are weighted by its precision.
 
     `moved`, `deviation`: (C, N, N) mm; `mask`: (N, N) above 0.5 where there is tissue.
@@ -75,15 +75,15 @@ def seen_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion
         mean = [gaussian_filter(w * d, sigma) for w, d in zip(weight, moved, strict=True)]
         return np.asarray(np.stack(mean) / np.maximum(total, 1e-12))
 
-    least, most = _SMOOTH_MM
-    slopes = np.array(np.gradient(smooth(most), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
-    steep = np.linalg.norm(slopes, axis=(0, 1))[inside].max(initial=0.0)
+    least_mm, most_mm = _SMOOTH_MM
+    slopes = np.array(np.gradient(smooth(most_mm), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
+    slope = np.linalg.norm(slopes, axis=(0, 1))[inside].max(initial=0.0)
     spread = float(np.median(deviation[:, inside].max(axis=0)))
-    mean = smooth(min(max(_PER_MM * spread, least), most))
+    mean = smooth(min(max(_PER_MM * spread, least_mm), most_mm))
     rows, columns = np.nonzero(inside)
     places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
     points = np.asarray(places * grid.pitch_mm, np.float64)
-    return SeenMotion(points, mean[:, inside].T, grid.pitch_mm**2, float(steep))
+    return SeenMotion(points, mean[:, inside].T, grid.pitch_mm**2, float(slope))
 
 
 def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float | None, alpha: float) -> Floats:
@@ -94,14 +94,16 @@ def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float | None, a
     """
     seen_mm = float(np.sqrt(len(motion.points) * motion.area_mm2 / np.pi))
     if opening_mm is not None:
-        whole = seen_mm > _WHOLE * opening_mm
-        return _pull(motion, tissue, opening_mm, None if whole else seen_mm, alpha)[0]
-    least = float(np.linalg.norm(motion.points, axis=1).max())  # the skull covers no tissue that is seen
-    near, wide = (_pull(motion, tissue, radius, seen_mm, alpha) for radius in (least, max(OPEN_MM, least)))
+        is_wide = seen_mm > _WHOLE * opening_mm
+        return _pull(motion, tissue, opening_mm, None if is_wide else seen_mm, alpha)[0]
+    least_mm = float(np.linalg.norm(motion.points, axis=1).max())  # the skull covers no tissue that is seen
+    narrow, wide = (
+        _pull(motion, tissue, radius, seen_mm, alpha) for radius in (least_mm, max(OPEN_MM, least_mm))
+    )
     # Pulls beside the contact along the force, and the part of the wide opening at which they vanish.
-    excess, lack = (float(beside @ force) / float(force @ force) for force, beside in (near, wide))
-    part = 0.5 if excess == lack else float(np.clip(excess / (excess - lack), 0, 1))
-    return (1 - part) * near[0] + part * wide[0]
+    excess, lack = (float(side @ force) / float(force @ force) for force, side in (narrow, wide))
+    share = 0.5 if excess == lack else float(np.clip(excess / (excess - lack), 0, 1))
+    return (1 - share) * narrow[0] + share * wide[0]
 
 
 def _pull(
@@ -116,27 +118,27 @@ def _pull(
     sheet = MembraneSheet(tissue.membrane, max(tissue.stretch, _LEAST_STRETCH)) if tissue.membrane else None
     system = assemble(volume, "ogden", tissue.poisson, sheet, alpha)
     value, size = embedding.value, np.linalg.norm(motion.moved, axis=1)
-    firm = _FIRM_PER_MM * motion.area_mm2
-    nodal = firm * (value.T @ value)
+    stiffness = _FIRM_PER_MM * motion.area_mm2
+    nodal = stiffness * (value.T @ value)
     balance = Balance(system, sp.csr_array(sp.kron(nodal, np.eye(3), format="csr")))
-    seen = wanted = motion.moved @ TO_CAMERA
+    observed = targets = motion.moved @ TO_CAMERA
     u, energy, part, step = np.zeros_like(volume.points), 0.0, 0.0, _FIRST
     while part < 1:
-        further = min(part + step, 1.0)
-        start = u * (further / part) if part else u
+        next_part = min(part + step, 1.0)
+        start = u * (next_part / part) if part else u
         try:
-            pull = further * firm * (value.T @ wanted)
+            pull = next_part * stiffness * (value.T @ targets)
             u, _, energy, _ = balance.find(pull, start, u, energy, _LEAST_JACOBIAN)
         except ExcessiveLoad:
             step *= 0.5
             if step < _SHORTEST:
                 raise
         else:
-            part = further
+            part = next_part
     for _ in range(_REFINEMENTS):  # the springs' ends are moved on by as much as the tissue lags
-        wanted = wanted + seen - value @ u
-        u, _, energy, _ = balance.find(firm * (value.T @ wanted), u, u, energy, _LEAST_JACOBIAN)
-    traction, contact = firm * (wanted - value @ u), size >= _MOVED * size.max()
+        targets = targets + observed - value @ u
+        u, _, energy, _ = balance.find(stiffness * (value.T @ targets), u, u, energy, _LEAST_JACOBIAN)
+    traction, contact = stiffness * (targets - value @ u), size >= _MOVED * size.max()
     return TO_CAMERA @ traction[contact].sum(axis=0), TO_CAMERA @ traction[~contact].sum(axis=0)
 
 

@@ -19,7 +19,7 @@ METHODS = Registry("sulcus.method", "method", "method", {})
 _MOST_MN = 1e12  # larger forces are errors
 
 
-class Plugged:
+class PluginMethod:
     """A method of another package or script; its errors become one line that names it."""
 
     def __init__(self, method: Any, label: str, source: str = "") -> None:
@@ -39,16 +39,16 @@ class Plugged:
         with as_user_error(self._label):
             # A copy, so that a method that writes to its input does not change that of the next.
             estimate = self._method(copy.deepcopy(frame), scene, picture)
-        return self._checked(estimate, frame.confidence.shape)
+        return self._check(estimate, frame.confidence.shape)
 
     def _revise(self, contact_free: Mask) -> list[ForceEstimate]:
         with as_user_error(self._label):
             estimates = list(self._method.revise(contact_free.copy()))
             if len(estimates) != len(contact_free):
                 raise TypeError(f"revises {len(estimates)} frames of {len(contact_free)}")
-        return [self._checked(estimate, None) for estimate in estimates]
+        return [self._check(estimate, None) for estimate in estimates]
 
-    def _checked(self, estimate: Any, size: tuple[int, ...] | None) -> ForceEstimate:
+    def _check(self, estimate: Any, size: tuple[int, ...] | None) -> ForceEstimate:
         """`size`: height and width that a density must have; None: a density is dropped."""
         density = None
         with as_user_error(self._label):
@@ -72,5 +72,5 @@ def list_installed() -> dict[str, Method]:
         method, label = METHODS.load(name), METHODS.label(name)
         if not callable(method):
             raise UserError(f"{label}: not a method, it can't be called")
-        methods[name] = Plugged(method, label, METHODS.source(name))
+        methods[name] = PluginMethod(method, label, METHODS.source(name))
     return methods

@@ -38,7 +38,7 @@ class Model:
         name = find_name(card)
         return f"{name}, pretrained" if name else f"trained on {len(card.split.get('fit', []))} sequences"
 
-    def described(self) -> dict[str, object]:
+    def describe(self) -> dict[str, object]:
         """The model's properties, for the report."""
         card = self.predictor.card
         return {**card.settings.model_dump(mode="json"), "force_gain": card.force_gain}
@@ -65,15 +65,15 @@ class Model:
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`; a monocular network uses the flow only."""
         if self._estimator is None or self._estimator[0] is not scene:
-            about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
-            self._estimator = scene, ForceEstimator(self.predictor, *about)
+            constants = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
+            self._estimator = scene, ForceEstimator(self.predictor, *constants)
         force = self._estimator[1].estimate(frame)
         estimate = ForceEstimate(force.force_mn, force.map.to_image() if picture else None)
         if not force.bands:
             return estimate
         band = force.bands[LEVEL]
-        likely = None
+        mixture = None
         if np.isfinite(force.force_mn).all():
             deviation = (band.axes_high[0] - band.axes_low[0]) / (2 * ndtri(0.5 + LEVEL / 2))
-            likely = ForceMixture(np.ones(1), force.force_mn[None], np.diag(deviation**2)[None])
-        return replace(estimate, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=likely)
+            mixture = ForceMixture(np.ones(1), force.force_mn[None], np.diag(deviation**2)[None])
+        return replace(estimate, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=mixture)

@@ -33,7 +33,7 @@ from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
-from synth.flow.recording.find_tissue import touches_border
+from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
 
@@ -90,11 +90,13 @@ class TissueWeights:
         first = self.tissues[0]
         if first.membrane == 0:
             return first
-        of = [
-            k for k, one in enumerate(self.tissues) if (one.edge, one.stretch) == (first.edge, first.stretch)
+        indices = [
+            k
+            for k, tissue in enumerate(self.tissues)
+            if (tissue.edge, tissue.stretch) == (first.edge, first.stretch)
         ]
-        logs = np.log([self.tissues[k].membrane for k in of])
-        return replace(first, membrane=float(f"{np.exp(np.average(logs, weights=self.weight[of])):.3g}"))
+        logs = np.log([self.tissues[k].membrane for k in indices])
+        return replace(first, membrane=float(f"{np.exp(np.average(logs, weights=self.weight[indices])):.3g}"))
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Gains:
     high: Floats  # (K,)
     unsolved: int = 0  # states whose mechanics found no solution, or with one camera
 
-    def at(self, size: float) -> tuple[float, float]:
+    def interpolate(self, size: float) -> tuple[float, float]:
         return float(np.interp(size, self.size, self.low)), float(np.interp(size, self.size, self.high))
 
 
@@ -124,10 +126,10 @@ class Physics:
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         self._frames: list[Observation] = []
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
-        first, still = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
+        first, no_motion = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
         self._large, self._gains = list[tuple[Observation, SeenMotion]](), NO_GAIN
-        self._weights = TissueWeights(first, np.ones(1), still, False)
+        self._weights = TissueWeights(first, np.ones(1), no_motion, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
@@ -140,49 +142,51 @@ class Physics:
         if self._scene is not scene:
             self._begin(scene, moved.shape[2])
         moved, spread = (self._view.mean(field.transpose(2, 0, 1)) for field in (moved, spread))
-        observed = observe(moved, spread, self._view.mask)
-        self._frames.append(observed)
+        observation = observe(moved, spread, self._view.mask)
+        self._frames.append(observation)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
         if frame.trusted:
-            surface = large_motion.seen_motion(moved, spread, self._view.mask, GRID)
-            last = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
-            if surface.slope > max(large_motion.STEEP, last):
-                self._large.append((observed, surface))
+            surface = large_motion.measure_motion(moved, spread, self._view.mask, GRID)
+            least_slope = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
+            if surface.slope > max(large_motion.STEEP, least_slope):
+                self._large.append((observation, surface))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
-        if observed.signal_mm > max(TISSUES.growth * self._weighed_mm, posterior.MODEL.least_mm):
-            self._weighed_mm = observed.signal_mm
+        if observation.signal_mm > max(TISSUES.growth * self._weighed_mm, posterior.MODEL.least_mm):
+            self._weighed_mm = observation.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
-        return self._conclude(*self._infer(observed), picture=picture)
+        return self._conclude(*self._infer(observation), picture=picture)
 
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
         assert self._scene is not None
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
         times, tracked = np.array(self._times), np.flatnonzero(self._trusted)
-        free = [self._frames[k] for k in np.flatnonzero(contact_free) if self._frames[k].size_mm > 0]
+        free_frames = [self._frames[k] for k in np.flatnonzero(contact_free) if self._frames[k].size_mm > 0]
         breaths = TISSUES.breath_hz * float(np.diff(times)[contact_free[1:] & contact_free[:-1]].sum())
-        if bounded := self._scene.living and len(tracked) > 0 and breaths < 0.5:
+        if is_bounded := self._scene.living and len(tracked) > 0 and breaths < 0.5:
             frames = [self._frames[k] for k in tracked]
             quiet, factor = quietest_frames(times[tracked], frames)
             bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
             if breaths > TISSUES.quiet:
-                bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
-            least = min(bounds, key=lambda bound: float(np.square(bound).sum()))
-            own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
+                bounds.append(
+                    turning_factor(breaths) * posterior.own_motion(basis, free_frames, correlated=False)
+                )
+            least_bound = min(bounds, key=lambda bound: float(np.square(bound).sum()))
+            own_mm = least_bound.clip(-TISSUES.living_mm, TISSUES.living_mm)
         else:
-            own_mm = posterior.own_motion(basis, free)
-        self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
+            own_mm = posterior.own_motion(basis, free_frames)
+        self._weights = weigh_tissues(self._scene, self._frames, own_mm, is_bounded and bool(own_mm.any()))
         strongest = max(self._frames, key=lambda frame: frame.signal_mm)
         if len(strongest.moved) == 2:
             self._gains = find_monocular_gains(self._weights, strongest, bool(self._large))
         else:
             self._gains = find_gains(self._scene, self._weights, self._large)
         self._contact_free = int(contact_free.sum())
-        answers = [self._infer(frame) for frame in self._frames]
-        self._loads = [answer.load.astype(np.float32) for answer, *_ in answers]
-        return widen_small_forces([self._conclude(*answer, picture=False) for answer in answers])
+        posteriors = [self._infer(frame) for frame in self._frames]
+        self._loads = [answer.load.astype(np.float32) for answer, *_ in posteriors]
+        return widen_small_forces([self._conclude(*answer, picture=False) for answer in posteriors])
 
     @property
     def view(self) -> GridView:
@@ -207,23 +211,24 @@ class Physics:
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
         sizes = ", ".join(f"{np.sqrt(square.sum(axis=1).mean()):.2g}" for square in np.square(moved))
-        stated = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
+        statement = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
         if self._weights.assumed or not self._contact_free:
-            known = "only part of a breath" if self._contact_free else "no span"
-            stated = f"{'at most, ' * self._weights.assumed}{stated}"
-            stated = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {stated}"
-        return [describe(self._weights, self._scene), stated]
+            shortfall = "only part of a breath" if self._contact_free else "no span"
+            statement = f"{'at most, ' * self._weights.assumed}{statement}"
+            lack = f"{shortfall} without contact is known in video time (sensor.free_s, pulse.free_s)"
+            statement = f"{lack}: {statement}"
+        return [describe(self._weights, self._scene), statement]
 
     @property
     def warnings(self) -> list[str]:
         """What its result must not be taken for."""
         if self._scene is None or not self._gains.unsolved:
             return []
-        what = "the surface is bent beyond the range of the linear inverse"
+        fault = "the surface is bent beyond the range of the linear inverse"
         if self._is_beyond:
-            return [f"{what}, with one camera and perhaps a membrane: forces may be many times larger"]
-        why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
-        return [f"{what}, {why}: its largest forces are out of range, their intervals wide"]
+            return [f"{fault}, with one camera and perhaps a membrane: forces may be many times larger"]
+        reason = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
+        return [f"{fault}, {reason}: its largest forces are out of range, their intervals wide"]
 
     @property
     def _is_beyond(self) -> bool:
@@ -232,27 +237,30 @@ class Physics:
         may_be_covered = self._scene is not None and self._scene.membrane != "stripped"
         return self._gains.unsolved > 0 and len(self._weights.own_mm) == 2 and may_be_covered
 
-    def _conclude(self, answer: Posterior, least: float, most: float, picture: bool) -> ForceEstimate:
+    def _conclude(self, answer: Posterior, low_gain: float, high_gain: float, picture: bool) -> ForceEstimate:
         """The estimate of `_infer`'s answer."""
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        factor, cameras = float(np.sqrt(least * most)), len(self._weights.own_mm) - 1
+        factor, cameras = float(np.sqrt(low_gain * high_gain)), len(self._weights.own_mm) - 1
         gain = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty))
         low, high = size_interval(answer.force, gain, cameras)
-        low, high = (np.nan, np.nan) if self._is_beyond else (low * least / factor, high * most / factor)
+        low, high = (
+            (np.nan, np.nan) if self._is_beyond else (low * low_gain / factor, high * high_gain / factor)
+        )
         density = np.float32(young) * self._picture(answer.load) if picture else None
-        likely = answer.force.times(young).with_gain(
-            float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
+        mixture = answer.force.scale_by(young).with_gain(
+            float(np.hypot(TISSUES.gain, 0.3 * np.log(high_gain / low_gain)))
         )
         size = young * answer.force.find_size(cameras)
-        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely, size)
+        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, mixture, size)
 
     def _infer(self, frame: Observation) -> tuple[Posterior, float, float]:
         """The posterior with the gain of large motion, and the ends of that gain."""
         linear = infer(self._weights, frame)
-        least, most = self._gains.at(float(np.linalg.norm(linear.force.mean)))
-        factor = float(np.sqrt(least * most))
-        return replace(linear, force=linear.force.times(factor), load=factor * linear.load), least, most
+        low_gain, high_gain = self._gains.interpolate(float(np.linalg.norm(linear.force.mean)))
+        factor = float(np.sqrt(low_gain * high_gain))
+        answer = replace(linear, force=linear.force.scale_by(factor), load=factor * linear.load)
+        return answer, low_gain, high_gain
 
     def _picture(self, load: Floats) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
@@ -262,12 +270,12 @@ class Physics:
     def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
         """The force density over E at the nodes of a square lattice about the tissue's centre, and their
         distance [mm]."""
-        known = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0]).lattice
-        step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
-        column, row = np.rint(known.nodes / step).astype(int).T
-        most = max(column.max(), row.max())
-        lattice = np.zeros((2 * most + 1,) * 2)
-        lattice[row + most, column + most] = np.linalg.norm(load, axis=1) / known.node_area
+        grid = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0]).lattice
+        step = np.diff(np.unique(grid.nodes[:, 0].round(6))).min()
+        column, row = np.rint(grid.nodes / step).astype(int).T
+        half = max(column.max(), row.max())
+        lattice = np.zeros((2 * half + 1,) * 2)
+        lattice[row + half, column + half] = np.linalg.norm(load, axis=1) / grid.node_area
         return lattice, float(step)
 
 
@@ -281,9 +289,9 @@ def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list
     count = np.arange(1, len(frames) + 1)
     share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
     factor = turning_factor(share)
-    moved = factor * np.sqrt(size[order] + posterior.MODEL.least_mm**2)
-    moved[share < TISSUES.quiet * share[-1]] = np.inf  # the least of many would be too little
-    best = int(moved.argmin())
+    bounds_mm = factor * np.sqrt(size[order] + posterior.MODEL.least_mm**2)
+    bounds_mm[share < TISSUES.quiet * share[-1]] = np.inf  # the least of many would be too little
+    best = int(bounds_mm.argmin())
     return [int(k) for k in order[best // 2 : best + 1]], float(factor[best])
 
 
@@ -297,19 +305,19 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     low, high = scene.poisson
     middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
-    none, *stiffnesses = TISSUES.membranes_mm
+    bare, *stiffnesses = TISSUES.membranes_mm
     if scene.membrane_mn_per_mm is not None:
         ends = np.array(scene.membrane_mn_per_mm) / (scene.young_kpa or UNKNOWN_YOUNG_KPA)
         between = np.geomspace(ends[0], ends[1], TISSUES.shown)
         stiffnesses = sorted({float(f"{stiffness:.2g}") for stiffness in between})
-    stiff = {"stripped": [none], "intact": stiffnesses, "unknown": [none, *stiffnesses]}[scene.membrane]
+    membranes = {"stripped": [bare], "intact": stiffnesses, "unknown": [bare, *stiffnesses]}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
-    if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
+    if "free" not in edges and measure_border_share(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
         TissueKind(edge, membrane, middle, stretch)
         for edge in edges
-        for membrane in stiff
+        for membrane in membranes
         for stretch in (TISSUES.stretches if membrane else TISSUES.stretches[:1])
     )
 
@@ -317,17 +325,17 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
 def _prior(tissues: Sequence[TissueKind], scene: MethodContext) -> Floats:
     """Logarithm of each tissue's prior probability: log-normal in the stiffness of a membrane that is stated
     to be intact, unless its stiffness is too."""
-    stiff = np.array([tissue.membrane for tissue in tissues])
+    stiffness = np.array([tissue.membrane for tissue in tissues])
     is_usual = scene.membrane == "intact" and scene.membrane_mn_per_mm is None
-    covered, spread = stiff > 0, TISSUES.stiffer if is_usual else np.inf
-    stiffness = np.log(np.where(covered, stiff, 1.0) * (scene.young_kpa or UNKNOWN_YOUNG_KPA))
-    density = -0.5 * np.square((stiffness - np.log(TISSUES.stiff_mn_per_mm)) / spread)
+    is_covered, spread = stiffness > 0, TISSUES.stiffer if is_usual else np.inf
+    log_stiffness = np.log(np.where(is_covered, stiffness, 1.0) * (scene.young_kpa or UNKNOWN_YOUNG_KPA))
+    density = -0.5 * np.square((log_stiffness - np.log(TISSUES.stiff_mn_per_mm)) / spread)
     share = {"intact": 1.0, "stripped": 0.0, "unknown": TISSUES.intact}[scene.membrane]
-    out = np.full(len(tissues), -np.inf)
-    for part, weight in ((covered, share), (~covered, 1 - share)):
+    log_prior = np.full(len(tissues), -np.inf)
+    for part, weight in ((is_covered, share), (~is_covered, 1 - share)):
         if part.any() and weight > 0:
-            out[part] = np.log(weight) + log_softmax(density[part])
-    return out
+            log_prior[part] = np.log(weight) + log_softmax(density[part])
+    return log_prior
 
 
 def weigh_tissues(
@@ -336,37 +344,39 @@ def weigh_tissues(
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
     strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [frame for frame in strongest if frame.size_mm > 0]
-    known: dict[TissueKind, float] = {}  # evidence of those that are computed
+    evidences: dict[TissueKind, float] = {}  # evidence of those that are computed
 
     def evidence(tissue: TissueKind, load: Callable[..., LoadBasis] = posterior.load_basis) -> float:
-        if tissue not in known:
+        if tissue not in evidences:
             basis = load(len(own_mm), tissue)
-            known[tissue] = TISSUES.temper * sum(
+            evidences[tissue] = TISSUES.temper * sum(
                 posterior.evidence(basis, frame, own_mm) for frame in strongest
             )
-        return known[tissue]
+        return evidences[tissue]
 
     candidates = candidate_tissues(scene)
     logs = dict(zip(candidates, _prior(candidates, scene), strict=True))
     score = dict[TissueKind, float]()
     for part in (False, True):
-        if group := [each for each in candidates if (each.membrane > 0) is part]:
+        if group := [tissue for tissue in candidates if (tissue.membrane > 0) is part]:
             best = find_largest(group, lambda tissue: evidence(tissue) + logs[tissue])
             # Where it isn't known whether there is a membrane, the best with and without one are compared by
             # their evidence: spread over stiffnesses, it would count for bare tissue too.
-            alike = [each for each in group if replace(each, membrane=best.membrane) == best]
-            alike = alike if scene.membrane == "intact" else [best]
-            score |= _share(alike, [evidence(each) for each in alike], [logs[each] for each in alike])
+            variants = [tissue for tissue in group if replace(tissue, membrane=best.membrane) == best]
+            variants = variants if scene.membrane == "intact" else [best]
+            score |= _share(
+                variants, [evidence(tissue) for tissue in variants], [logs[tissue] for tissue in variants]
+            )
     best = max(score, key=lambda tissue: score[tissue])
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != best.poisson]
     score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
     for nu in others:
         tissue = replace(best, poisson=nu)
-        more = evidence(tissue, posterior.load_basis_alone) - evidence(best)
+        delta = evidence(tissue, posterior.load_basis_alone) - evidence(best)
         # As evidence between stiffnesses: a ratio that fits must not bring its one stiffness alone.
-        more = TISSUES.doubt * np.tanh(more / TISSUES.doubt) if scene.membrane == "intact" else more
-        score[tissue] = score[best] + more
+        delta = TISSUES.doubt * np.tanh(delta / TISSUES.doubt) if scene.membrane == "intact" else delta
+        score[tissue] = score[best] + delta
     weight = np.maximum(softmax(list(score.values())), TISSUES.unlikely)
     order = np.argsort(-weight, kind="stable")
     tissues = list(score)
@@ -388,25 +398,25 @@ def find_largest(candidates: Sequence[TissueKind], value: Callable[[TissueKind],
 
     Along the membrane's stiffness evidence has one maximum, which is another one for each edge.
     """
-    stiffness = sorted({each.membrane for each in candidates})
+    stiffness = sorted({tissue.membrane for tissue in candidates})
 
     def climb(tissue: TissueKind) -> TissueKind:
         for step in (-1, 1):
-            place = stiffness.index(tissue.membrane) + step
-            while 0 <= place < len(stiffness):
-                beside = replace(tissue, membrane=stiffness[place])
-                if value(beside) <= value(tissue):
+            index = stiffness.index(tissue.membrane) + step
+            while 0 <= index < len(stiffness):
+                neighbour = replace(tissue, membrane=stiffness[index])
+                if value(neighbour) <= value(tissue):
                     break
-                tissue, place = beside, place + step
+                tissue, index = neighbour, index + step
         return tissue
 
     middle = stiffness[len(stiffness) // 2]
-    last, best = None, climb(next(each for each in candidates if each.membrane == middle))
-    while best != last:
-        last = best
-        edges = [each for each in candidates if replace(each, edge=best.edge) == best]
+    previous, best = None, climb(next(tissue for tissue in candidates if tissue.membrane == middle))
+    while best != previous:
+        previous = best
+        edges = [tissue for tissue in candidates if replace(tissue, edge=best.edge) == best]
         best = max((best, *map(climb, edges)), key=value)
-        stretches = [each for each in candidates if replace(each, stretch=best.stretch) == best]
+        stretches = [tissue for tissue in candidates if replace(tissue, stretch=best.stretch) == best]
         best = climb(max((best, *stretches), key=value))
     return best
 
@@ -433,8 +443,8 @@ def find_gains(
 ) -> Gains:
     """Gains of frames with large motion, of rising slope, on the middle tissue; few of them are solved."""
     tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
-    seen = touches_border(scene.tissue) <= TISSUES.cut
-    opening_mm = min(float(radius), large_motion.OPEN_MM) if seen else None
+    is_edge_seen = measure_border_share(scene.tissue) <= TISSUES.cut
+    opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
     for frame, motion in large[::-2][: TISSUES.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))
@@ -474,10 +484,12 @@ def _places() -> Floats:
 def observe(moved: Field, spread: Field, mask: Field) -> Observation:
     """Samples displacement and its deviation, (C, N, N) mm on `GRID`, at the compliance's points; outside the
     tissue's mask (N, N) the deviation is infinite."""
-    at = _places()
-    inside = map_coordinates(mask, at, order=1, mode="constant") > 0.5
+    places = _places()
+    inside = map_coordinates(mask, places, order=1, mode="constant") > 0.5
     values = [
-        np.stack([map_coordinates(part, at, order=1, mode="nearest") for part in parts]).astype(np.float64)
+        np.stack([map_coordinates(part, places, order=1, mode="nearest") for part in parts]).astype(
+            np.float64
+        )
         for parts in (moved, spread)
     ]
     return Observation(np.where(inside, values[0], 0.0), np.where(inside, values[1], np.inf))
@@ -491,6 +503,6 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
         return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
     stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
-    likely = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
-    shown = "motion does not reliably show whether there is a membrane (meta.yaml's `membrane`)"
-    return f"{shown}: intervals hold both, {likely}; {rest}"
+    likeliest = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
+    verdict = "motion does not reliably show whether there is a membrane (meta.yaml's `membrane`)"
+    return f"{verdict}: intervals hold both, {likeliest}; {rest}"

@@ -111,20 +111,20 @@ class Posterior:
 def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     """The reduced compliance of a tissue, observed in 2 or 3 components: from this user's cache, or computed
     (half a CPU-second, and one for each block and Poisson's ratio) and stored there."""
-    stored, lattice = _stored_basis(components, tissue), compliance.lattice()
+    stored, lattice = _fetch_basis(components, tissue), compliance.lattice()
     shares = _contact_shares(lattice)
-    near = np.square(lattice.points[:, None] - lattice.points[None]).sum(axis=-1)
-    near = np.exp(-near / (2 * MODEL.around_mm**2))
-    own = np.kron(np.eye(components), polynomials(lattice.points))
+    distance2 = np.square(lattice.points[:, None] - lattice.points[None]).sum(axis=-1)
+    weights = np.exp(-distance2 / (2 * MODEL.around_mm**2))
+    polynomial_basis = np.kron(np.eye(components), polynomials(lattice.points))
     return LoadBasis(
-        np.hstack([stored["motion"], own]),
+        np.hstack([stored["motion"], polynomial_basis]),
         stored["size"],
         stored["force"],
         stored["omitted"],
         stored["contacts"].transpose(0, 2, 1),
         stored["loads"].astype(np.float64),
         shares,
-        near / near.sum(axis=1, keepdims=True),
+        weights / weights.sum(axis=1, keepdims=True),
         lattice,
     )
 
@@ -133,16 +133,16 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
 def load_basis_alone(components: int, tissue: TissueKind) -> LoadBasis:
     """The same for a tissue that is likely to be the only one of its Poisson's ratio: computed at half the
     cost of a first one."""
-    _stored_basis(components, tissue, alone=True)
+    _fetch_basis(components, tissue, alone=True)
     return load_basis(components, tissue)
 
 
-def _stored_basis(components: int, tissue: TissueKind, *, alone: bool = False) -> dict[str, Any]:
-    kept = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
-    key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {kept}".encode()
+def _fetch_basis(components: int, tissue: TissueKind, *, alone: bool = False) -> dict[str, Any]:
+    constants = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
+    key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {constants}".encode()
     faults = ValueError, EOFError, KeyError, BadZipFile  # of files that were cut off: they are computed again
     with say_if_long(_WAIT):
-        return cache.cached(
+        return cache.load_or_make(
             "basis/npz", key, lambda: _reduce(components, tissue, alone), _dump, _load, faults, _STORED
         )
 
@@ -155,8 +155,8 @@ def _reduce(components: int, tissue: TissueKind, alone: bool = False) -> dict[st
     """What of a `LoadBasis` depends on the tissue, by attribute; large arrays in single precision."""
     lattice = compliance.lattice()
     matrix, count, rank = compliance.solve(tissue, components, alone=alone), len(lattice.nodes), MODEL.rank
-    apart = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
-    kernel = np.exp(-apart / (2 * MODEL.smooth_mm**2)) * lattice.node_area[:, None] * lattice.node_area
+    distance2 = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
+    kernel = np.exp(-distance2 / (2 * MODEL.smooth_mm**2)) * lattice.node_area[:, None] * lattice.node_area
     root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
     root /= np.linalg.norm(root.sum(axis=0))
     smooth = (matrix.reshape(-1, count) @ root).reshape(len(matrix), 3 * count)
@@ -180,15 +180,17 @@ def _reduce(components: int, tissue: TissueKind, alone: bool = False) -> dict[st
 
 def _contact_shares(lattice: Lattice) -> Floats:
     """Share (K, H) of each contact carried by each node: radius by radius, at every node within reach."""
-    apart = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
+    distance2 = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
     within = np.hypot(*lattice.nodes.T) <= MODEL.reach_mm
-    spread = [np.clip(1 - apart / r**2, 0, None) ** 2 * lattice.node_area[:, None] for r in MODEL.radii_mm]
+    spread = [
+        np.clip(1 - distance2 / r**2, 0, None) ** 2 * lattice.node_area[:, None] for r in MODEL.radii_mm
+    ]
     return np.concatenate([(part / part.sum(axis=0))[:, within] for part in spread], axis=1)
 
 
 def _dump(stored: dict[str, Any]) -> bytes:
-    np.savez(held := io.BytesIO(), **stored)
-    return held.getvalue()
+    np.savez(buffer := io.BytesIO(), **stored)
+    return buffer.getvalue()
 
 
 def _load(data: bytes) -> dict[str, Any]:
@@ -214,16 +216,16 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated:
     terms = polynomials(basis.lattice.points)
     excess = []
     for frame in contact_free:
-        fitted, error = list[Floats](), list[Floats]()
+        coefficients, errors = list[Floats](), list[Floats]()
         for axis in range(components):
             weight = 1 / (MODEL.correlated * (frame.deviation[axis] ** 2 + MODEL.least_mm**2))
             gram = terms.T @ (terms * weight[:, None])
             if np.linalg.cond(gram) < 1e8:
-                error.append(np.linalg.inv(gram))
-                fitted.append(error[-1] @ (terms.T @ (weight * frame.moved[axis])))
-        if len(fitted) == components:
-            both = np.concatenate(fitted)
-            excess.append(np.outer(both, both) - block_diag(*error))
+                errors.append(np.linalg.inv(gram))
+                coefficients.append(errors[-1] @ (terms.T @ (weight * frame.moved[axis])))
+        if len(coefficients) == components:
+            vector = np.concatenate(coefficients)
+            excess.append(np.outer(vector, vector) - block_diag(*errors))
     if not excess:
         return np.zeros((components, terms.shape[1], 0))
     if correlated:
@@ -253,30 +255,30 @@ def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
     sizes = _contact_sizes(frame)
     levels, score = _weigh(basis, frame, own_mm, sizes)
     # Systematic draws: each hypothesis is drawn in proportion to its probability, however many there are.
-    likely = np.cumsum(np.exp(score - logsumexp(score)))
-    drawn = np.searchsorted(likely, (np.arange(MODEL.draws) + 0.5) / MODEL.draws * likely[-1])
-    best, times = np.unique(drawn, return_counts=True)
-    share = times / MODEL.draws
-    force, covariance = np.empty((len(best), 3)), np.empty((len(best), 3, 3))
-    coefficients, carried = np.zeros(rank), np.zeros((len(basis.shares), 3))
-    for k, (hypothesis, part) in enumerate(zip(best, share, strict=True)):
+    cumulative = np.cumsum(np.exp(score - logsumexp(score)))
+    draws = np.searchsorted(cumulative, (np.arange(MODEL.draws) + 0.5) / MODEL.draws * cumulative[-1])
+    hypotheses, repeats = np.unique(draws, return_counts=True)
+    share = repeats / MODEL.draws
+    force, covariance = np.empty((len(hypotheses), 3)), np.empty((len(hypotheses), 3, 3))
+    coefficients, contact_load = np.zeros(rank), np.zeros((len(basis.shares), 3))
+    for k, (hypothesis, part) in enumerate(zip(hypotheses, share, strict=True)):
         level = levels[hypothesis // (len(sizes) * count + 1)]
-        inside = hypothesis % (len(sizes) * count + 1)
+        index = hypothesis % (len(sizes) * count + 1)
         force[k], covariance[k] = level.force, level.covariance
         mean = level.mean
-        if inside < len(sizes) * count:
-            h = int(inside % count)
-            variance = np.linalg.inv(level.square[h] + np.diag(1 / sizes[inside // count] ** 2))
+        if index < len(sizes) * count:
+            h = int(index % count)
+            variance = np.linalg.inv(level.square[h] + np.diag(1 / sizes[index // count] ** 2))
             contact = variance @ level.pull[h]
             # A contact adds its own force and reduces that of the smooth loads.
-            replaced = level.taken @ basis.contacts[:, h]
-            adds = np.eye(3) - basis.force @ replaced
-            force[k] += adds @ contact
-            covariance[k] += adds @ variance @ adds.T
-            mean = mean - replaced @ contact
-            carried += part * basis.shares[:, h, None] * contact
+            reduction = level.projection @ basis.contacts[:, h]
+            net_force = np.eye(3) - basis.force @ reduction
+            force[k] += net_force @ contact
+            covariance[k] += net_force @ variance @ net_force.T
+            mean = mean - reduction @ contact
+            contact_load += part * basis.shares[:, h, None] * contact
         coefficients += part * mean
-    load = (basis.loads @ coefficients).reshape(-1, 3) + carried
+    load = (basis.loads @ coefficients).reshape(-1, 3) + contact_load
     return Posterior(float(logsumexp(score)), ForceMixture(share, force, covariance), load)
 
 
@@ -294,38 +296,45 @@ def _weigh(
     modes = own_mm.reshape(basis.motion.shape[1] - rank, -1)
     motion = np.hstack([basis.motion[:, :rank], basis.motion[:, rank:] @ modes])
     weighed = motion * weight[:, None]
-    gram, right = motion.T @ weighed, weighed.T @ moved
-    known = weight > 0
-    rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
+    gram, moments = motion.T @ weighed, weighed.T @ moved
+    is_known = weight > 0
+    constant = float(
+        moved @ (weight * moved) - np.log(weight[is_known]).sum() + is_known.sum() * np.log(2 * np.pi)
+    )
     count = basis.contacts.shape[1]
     flat = basis.contacts.transpose(0, 2, 1).reshape(rank, -1)
-    exact = flat.astype(np.float64)
+    flat64 = flat.astype(np.float64)
     levels, evidences = list[_Level](), list[Floats]()
     for spread in MODEL.smooth:
         prior = np.concatenate([np.square(spread * basis.size), np.ones(modes.shape[1])])
         factor = cho_factor(gram + np.diag(1 / prior), lower=True)
-        mean = cho_solve(factor, right)
+        mean = cho_solve(factor, moments)
         log_det = 2 * np.log(np.diag(factor[0])).sum() + np.log(prior).sum()
-        alone = -0.5 * (rest - right @ mean + log_det)
-        taken = cho_solve(factor, gram[:, :rank])
-        left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
-        explained = (left @ flat).reshape(rank, 3, count)
+        smooth_score = -0.5 * (constant - moments @ mean + log_det)
+        projection = cho_solve(factor, gram[:, :rank])
+        residual_gram = (gram[:rank, :rank] - gram[:, :rank].T @ projection).astype(np.float32)
+        explained = (residual_gram @ flat).reshape(rank, 3, count)
         # Entries (a, b) of each contact's symmetric 3 x 3 matrix, summed over directions.
         square = np.empty((count, 3, 3))
         for a, b in combinations_with_replacement(range(3), 2):
             square[:, a, b] = np.einsum("rh,rh->h", basis.contacts[..., a], explained[:, b])
             square[:, b, a] = square[:, a, b]
-        pull = ((right[:rank] - gram[:, :rank].T @ mean) @ exact).reshape(3, count).T
+        pull = ((moments[:rank] - gram[:, :rank].T @ mean) @ flat64).reshape(3, count).T
         padded = np.zeros((len(prior), 3))
         padded[:rank] = basis.force.T
         covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.omitted) * spread**2
         total = basis.force @ mean[:rank], covariance
-        level = _Level(mean[:rank], square, pull, taken[:rank], *total)
+        level = _Level(mean[:rank], square, pull, projection[:rank], *total)
         levels.append(level)
-        scaled = square + np.eye(3) / np.square(sizes)[:, None, :, None]  # (S, H, 3, 3)
-        fit, log = _quadratic(scaled, pull)
-        gain = alone + 0.5 * (fit - log) - np.log(sizes).sum(axis=1, keepdims=True) - np.log(count)
-        evidences += [gain.ravel(), np.array([alone])]
+        precision = square + np.eye(3) / np.square(sizes)[:, None, :, None]  # (S, H, 3, 3)
+        quadratic, contact_log_det = _quadratic(precision, pull)
+        gain = (
+            smooth_score
+            + 0.5 * (quadratic - contact_log_det)
+            - np.log(sizes).sum(axis=1, keepdims=True)
+            - np.log(count)
+        )
+        evidences += [gain.ravel(), np.array([smooth_score])]
     return levels, np.concatenate(evidences)
 
 
@@ -356,6 +365,6 @@ class _Level:
     mean: Floats  # (R,) of the smooth loads' coefficients
     square: Floats  # (H, 3, 3) precision of each contact's force, from what smooth loads can't explain
     pull: Floats  # (H, 3) that precision times the force
-    taken: Floats  # (R, R) share of a displacement that smooth loads explain
+    projection: Floats  # (R, R) share of a displacement that smooth loads explain
     force: Floats  # (3,) total of the smooth loads
     covariance: Floats  # (3, 3) of that total

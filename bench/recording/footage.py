@@ -47,9 +47,9 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     )
 
 
-def _K(about: Depth, size: Size) -> Floats:
-    x, y = about.centre_px or ((size[1] - 1) / 2, (size[0] - 1) / 2)
-    return np.array([[about.focal_px, 0, x], [0, about.focal_px, y], [0, 0, 1.0]])
+def _K(lens: Depth, size: Size) -> Floats:
+    x, y = lens.centre_px or ((size[1] - 1) / 2, (size[0] - 1) / 2)
+    return np.array([[lens.focal_px, 0, x], [0, lens.focal_px, y], [0, 0, 1.0]])
 
 
 def _depth(recording: Recording, unit_mm: float, frame: FrameMotion, size: Size) -> Map | None:
@@ -62,11 +62,11 @@ def _depth(recording: Recording, unit_mm: float, frame: FrameMotion, size: Size)
     if path.suffix == ".npy":
         checked_file.check_file(path, _LARGEST_BYTES)
         with as_user_error(f"{path}: not a readable array"):
-            found = np.load(path, allow_pickle=False)
+            values = np.load(path, allow_pickle=False)
     else:
-        found = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
-    if found.shape[2:] == (3,) and found.dtype.kind == "f":
-        found = found[..., 2]
-    if found.shape != size or found.dtype.kind not in "uif":
-        raise UserError(f"{path}: {found.shape} {found.dtype}, but the video is {size}")
-    return np.asarray(found.astype(np.float32) * np.float32(unit_mm), np.float32)
+        values = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
+    if values.shape[2:] == (3,) and values.dtype.kind == "f":
+        values = values[..., 2]
+    if values.shape != size or values.dtype.kind not in "uif":
+        raise UserError(f"{path}: {values.shape} {values.dtype}, but the video is {size}")
+    return np.asarray(values.astype(np.float32) * np.float32(unit_mm), np.float32)

@@ -29,7 +29,7 @@ def export_recording(sequence: Sequence, folder: str | Path, instrument: int | N
     """
     force = force_of(sequence, instrument)
     time = np.asarray(sequence["time"][:], np.float64)
-    about: dict[str, object] = {
+    meta_keys: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
         "young_kpa": float(sequence.attrs["young_kpa"]),
@@ -54,8 +54,8 @@ def export_recording(sequence: Sequence, folder: str | Path, instrument: int | N
             recording_writer.write_pair(
                 part / _PAIR, optics.camera_of(sequence), stereo_checks.right_of(sequence)
             )
-            about["stereo"] = {"calibration": _PAIR}
-        recording_writer.write_meta(part, about)
+            meta_keys["stereo"] = {"calibration": _PAIR}
+        recording_writer.write_meta(part, meta_keys)
     return Path(folder)
 
 
@@ -63,11 +63,11 @@ def force_of(sequence: Sequence, instrument: int | None) -> Floats:
     """Force (T, 3) mN, camera axes, of one instrument (from 1) or of all. UserError if there is none."""
     if instrument is None:
         return np.asarray(sequence["force"][:], np.float64)
-    each = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
-    if instrument not in range(1, len(each) + 1):
-        has = f"has instruments 1 to {len(each)}" if each else "has no instrument"
-        raise UserError(f"instrument {instrument}: sequence {sequence.index} {has}")
-    return np.asarray(each[instrument - 1]["force_mn"], np.float64)
+    instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
+    if instrument not in range(1, len(instruments) + 1):
+        extent = f"has instruments 1 to {len(instruments)}" if instruments else "has no instrument"
+        raise UserError(f"instrument {instrument}: sequence {sequence.index} {extent}")
+    return np.asarray(instruments[instrument - 1]["force_mn"], np.float64)
 
 
 def _write_pictures(sequence: Sequence, field: str, folder: Path) -> None:

@@ -72,13 +72,13 @@ class ScaleCalibration(Section):
 
     @model_validator(mode="after")
     def _exactly_one_way(self) -> ScaleCalibration:
-        ways = (
+        options = (
             (self.focal_px, self.distance_mm),
             (self.bar_px, self.bar_mm),
             (self.checkerboard, self.corners, self.square_mm),
         )
-        begun = [way for way in ways if any(part is not None for part in way)]
-        if len(begun) != 1 or any(part is None for part in begun[0]):
+        given_options = [option for option in options if any(part is not None for part in option)]
+        if len(given_options) != 1 or any(part is None for part in given_options[0]):
             raise ValueError(
                 "give one whole way: focal_px + distance_mm, bar_px + bar_mm, or "
                 "checkerboard + corners + square_mm"
@@ -270,7 +270,7 @@ class Meta(Section):
         return self
 
 
-def commented() -> str:
+def document_meta() -> str:
     """A meta.yaml with every key, its meaning and its default; the scale is set to unknown."""
     return "\n".join(section_lines(Meta(scale_mm_per_px="unknown"))).rstrip() + "\n"
 
@@ -286,12 +286,12 @@ def read_meta(path: Path) -> Meta:
 
 def _find_files_outside(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
     """Yields the keys that name a file outside the recording's folder: absolute, with .., or by a link."""
-    for at in (("stereo", "calibration"), ("calibration", "checkerboard")):
-        block = config.values.get(at[0])
-        if isinstance(block, dict) and isinstance(name := block.get(at[1]), str):
+    for key in (("stereo", "calibration"), ("calibration", "checkerboard")):
+        section = config.values.get(key[0])
+        if isinstance(section, dict) and isinstance(name := section.get(key[1]), str):
             try:
                 inside = (folder / name).resolve().is_relative_to(folder.resolve())
             except (RuntimeError, ValueError, OSError):  # a NUL, a loop of links, too long
                 inside = False
             if not inside:
-                yield Mistake(at, f"{name[:80]!r} must be a file in the recording's folder: copy it there")
+                yield Mistake(key, f"{name[:80]!r} must be a file in the recording's folder: copy it there")

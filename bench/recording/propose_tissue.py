@@ -27,14 +27,14 @@ def propose_tissue(folder: Path) -> tuple[Path, Path, str]:
     if recording.tissue is not None:
         raise UserError(f"{recording.tissue}: exists; edit it, or remove it for a new proposal")
     footage = as_footage(recording, 1.0)
-    found = find_tissue(footage, RecordingFlowSettings())
-    if found is None:
+    proposal = find_tissue(footage, RecordingFlowSettings())
+    if proposal is None:
         raise UserError(f"{folder}: the rest frame shows nothing that can be tracked")
-    rest = next(one.rgb for one in footage.pictures() if one.index >= footage.rest_frame)
-    mask = cv2.resize(found[0].astype(np.uint8) * 255, rest.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    rest = next(picture.rgb for picture in footage.pictures() if picture.index >= footage.rest_frame)
+    mask = cv2.resize(proposal[0].astype(np.uint8) * 255, rest.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     edges = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-    drawn = cv2.drawContours(np.ascontiguousarray(rest), edges, -1, _OUTLINE, 2)
+    preview = cv2.drawContours(np.ascontiguousarray(rest), edges, -1, _OUTLINE, 2)
     paths = folder / "tissue.png", folder / SHOWN
-    for path, picture in zip(paths, (mask, drawn), strict=True):
+    for path, picture in zip(paths, (mask, preview), strict=True):
         write_picture(path, np.asarray(picture, np.uint8))
-    return *paths, found[1].message if found[1].severity in ("warning", "error") else ""
+    return *paths, proposal[1].message if proposal[1].severity in ("warning", "error") else ""

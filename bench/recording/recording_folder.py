@@ -125,7 +125,7 @@ class Recording:
             tissue &= inside
         return tissue
 
-    def within(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
+    def restrict(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
         """The recording with other tool masks, if given, and restricted to a region (see `region`)."""
         if masks is None:
             return replace(self, region=region)
@@ -156,8 +156,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     notes: list[str] = []
     footage = _find_video(folder, "video", "frames", about, notes)
     if not footage:
-        holds = ", ".join(sorted(path.name for path in folder.iterdir())[:8])
-        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found; it holds {holds}")
+        contents = ", ".join(sorted(path.name for path in folder.iterdir())[:8])
+        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found; it holds {contents}")
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
         notes.append(UNKNOWN_NOTE)
@@ -165,8 +165,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     if not isinstance(footage, VideoFile):
         notes += file_numbers.describe_gaps(list(frames), "frames/")
     elif (aspect := video.pixel_aspect(footage)) != 1:
-        how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
-        notes.append(f"the video: {how}; scale and calibration are assumed to be for square pixels")
+        correction = f"pixels {aspect:.3g} times as wide as high were made square, in width"
+        notes.append(f"the video: {correction}; scale and calibration are assumed to be for square pixels")
     times = _frame_times(folder / "frames.csv", frames, notes)
     if times is None and isinstance(footage, VideoFile):
         notes += _describe_start(footage)
@@ -175,7 +175,7 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     force, axes = _force(folder / "force.csv", about, notes)
     if axes != "xyz":  # without a direction no component can be compared
         about = about.model_copy(update={"sensor": about.sensor.size_only()})
-    about, times, force = _from_start(about, times, force, notes)
+    about, times, force = _count_from_start(about, times, force, notes)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _find_stereo(folder, about)
     if about.stereo is not None:
@@ -183,14 +183,14 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     right_frame = file_numbers.match_numbers(_numbers(right), frames, "right", notes)
     depth_frame = file_numbers.match_numbers(depths, frames, "depth/", notes)
     by_frame = {depth_frame[number]: path for number, path in depths.items()}
-    none = MaskFiles({}, None)
-    found = Recording(
+    no_masks = MaskFiles({}, None)
+    recording = Recording(
         folder,
         about,
         footage,
         times,
         force,
-        none,
+        no_masks,
         tissue,
         tuple(notes),
         None,
@@ -199,7 +199,7 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         by_frame,
         frames,
     )
-    return found.within(MaskFiles.find(folder / "masks", folder), None)
+    return recording.restrict(MaskFiles.find(folder / "masks", folder), None)
 
 
 def _describe_start(footage: VideoFile) -> list[str]:
@@ -207,11 +207,11 @@ def _describe_start(footage: VideoFile) -> list[str]:
     late_s = video.find_start(footage)
     if late_s < LATE_START_S:
         return []
-    what = "the start of its file" if footage.from_file else "that picture"
+    origin = "the start of its file" if footage.from_file else "that picture"
     return [
         f"{footage.path.name}: its first picture is {late_s:.3f} s after the start of its file, "
-        "with which sound or "
-        f"pictures that can't be decoded begin: times count from {what} (start: picture or file in meta.yaml)"
+        "with which sound or pictures that can't be decoded begin: times count from "
+        f"{origin} (start: picture or file in meta.yaml)"
     ]
 
 
@@ -219,8 +219,8 @@ def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     """The right camera's video or pictures, and depth pictures. UserError if meta.yaml does not match."""
     right = _find_video(folder, "right", "right", about, [])
     depths = file_numbers.find_stills(folder / "depth", (".png", ".npy"))
-    for found, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
-        if bool(found) != (section is not None):
+    for pictures, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
+        if bool(pictures) != (section is not None):
             raise UserError(
                 f"{folder}: right.mp4 or right/*.png requires stereo: in meta.yaml, depth/ requires depth:; "
                 f"{key}: or its pictures are missing"
@@ -233,32 +233,32 @@ def _find_video(folder: Path, name: str, pictures: str, about: Meta, notes: list
     several."""
     films = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
     films = [path for path in films if not path.name.startswith(".")]
-    named = [path for path in films if path.name.lower().startswith(f"{name}.")]
+    matches = [path for path in films if path.name.lower().startswith(f"{name}.")]
     stills = file_numbers.number_files(file_numbers.find_stills(folder / pictures, file_numbers.STILLS))
-    if not named and not stills and name == "video":
+    if not matches and not stills and name == "video":
         others = [path for path in films if not path.stem.lower().startswith("right")]
         if len(others) > 1:
-            some = ", ".join(path.name for path in others[:4])
+            names = ", ".join(path.name for path in others[:4])
             raise UserError(
-                f"{folder}: holds {some}, but no video.mp4: rename the one to be used, or keep only it"
+                f"{folder}: holds {names}, but no video.mp4: rename the one to be used, or keep only it"
             )
         notes += [f"{path.name} is taken for the video" for path in others]
-        named = others
-    if len(named) > 1:
-        some = ", ".join(path.name for path in named[:4])
+        matches = others
+    if len(matches) > 1:
+        names = ", ".join(path.name for path in matches[:4])
         raise UserError(
-            f"{folder}: holds {some}; keep one of them. If they are chapters of one recording, "
+            f"{folder}: holds {names}; keep one of them. If they are chapters of one recording, "
             "move them into a "
             "folder of their own, and bench import joins it"
         )
-    if named and stills:
-        raise UserError(f"{folder}: has {named[0].name} and pictures in {pictures}/; keep one of them")
-    if named:
-        return VideoFile(named[0], about.stream if name == "video" else None, about.start == "file")
+    if matches and stills:
+        raise UserError(f"{folder}: has {matches[0].name} and pictures in {pictures}/; keep one of them")
+    if matches:
+        return VideoFile(matches[0], about.stream if name == "video" else None, about.start == "file")
     return stills
 
 
-def _from_start(
+def _count_from_start(
     about: Meta, times: dict[int, float] | None, force: Force | None, notes: list[str]
 ) -> tuple[Meta, dict[int, float] | None, Force | None]:
     """Converts times since 1970, also those of meta.yaml's spans, to times since the first frame."""
@@ -266,8 +266,12 @@ def _from_start(
     start = first if first > _EPOCH_S else 0.0
     force_since_1970 = force is not None and bool(force.time_s[0] > _EPOCH_S)
     if force is not None and force_since_1970 != bool(start):
-        one, other = ("force.csv", "the video") if force_since_1970 else ("frames.csv", "force.csv")
-        notes.append(f"{one} counts from 1970, {other} doesn't: the offset between the two is unknown")
+        epoch_file, other_file = (
+            ("force.csv", "the video") if force_since_1970 else ("frames.csv", "force.csv")
+        )
+        notes.append(
+            f"{epoch_file} counts from 1970, {other_file} doesn't: the offset between the two is unknown"
+        )
         return about, times, force
     if not start:
         return about, times, force
@@ -276,21 +280,21 @@ def _from_start(
         times = {number: time - start for number, time in times.items()}
     if force is not None:
         force = replace(force, time_s=force.time_s - start)
-    return _spans_from(about, start), times, force
+    return _shift_spans(about, start), times, force
 
 
-def _spans_from(about: S, start: float) -> S:
+def _shift_spans(about: S, start: float) -> S:
     """A section of meta.yaml with its spans that count from 1970 counted from `start` [s]."""
 
-    def moved(value: object) -> object:
+    def shift(value: object) -> object:
         if isinstance(value, Section):
-            return _spans_from(value, start)
+            return _shift_spans(value, start)
         if not isinstance(value, tuple):
             return value
         since_1970 = len(value) == 2 and isinstance(value[0], float) and value[0] > _EPOCH_S
-        return (value[0] - start, value[1] - start) if since_1970 else tuple(map(moved, value))
+        return (value[0] - start, value[1] - start) if since_1970 else tuple(map(shift, value))
 
-    return about.model_copy(update={name: moved(value) for name, value in about})
+    return about.model_copy(update={name: shift(value) for name, value in about})
 
 
 def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[int, float] | None:
@@ -300,8 +304,8 @@ def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[
     columns = csv_table.read_csv(path, ("frame", "t_s"))
     frame, time = columns["frame"], columns["t_s"]
     number = np.where((frame >= 0) & (frame < 1e8), frame, -1).astype(np.int64)
-    whole = (number == frame).all() and len(np.unique(number)) == len(number)
-    if not whole or number.max() > 10 * len(number) + 1000:
+    is_valid = (number == frame).all() and len(np.unique(number)) == len(number)
+    if not is_valid or number.max() > 10 * len(number) + 1000:
         raise UserError(f"{path}: column frame must contain frame numbers, each once")
     frame_of = file_numbers.match_numbers(number.tolist(), frames, path.name, notes)
     times = {frame_of[n]: t for n, t in sorted(zip(number.tolist(), time.tolist(), strict=True)) if t == t}
@@ -356,18 +360,18 @@ def _force(path: Path, about: Meta, notes: list[str]) -> tuple[Force | None, str
             notes.append(f"{path.name}: {np.sum(~good)} rows {fault} left out")
         columns = {name: column[good] for name, column in columns.items()}
     newtons = np.stack([columns[name] for name in forces], axis=1)
-    lacking = ~np.isfinite(newtons)
-    usable = ~lacking.any(axis=1)
-    if usable.sum() < 2:
-        few = f"{path}: fewer than two rows with a time and three forces"
-        for name, empty in zip(forces, lacking.T, strict=True):
+    is_missing = ~np.isfinite(newtons)
+    is_usable = ~is_missing.any(axis=1)
+    if is_usable.sum() < 2:
+        message = f"{path}: fewer than two rows with a time and three forces"
+        for name, empty in zip(forces, is_missing.T, strict=True):
             if empty.any():
                 row = columns["row"][empty][0]
-                few += f"; {name} is empty in {empty.sum()} of {len(empty)} rows, first in row {row:.0f}"
-        raise UserError(few)
-    if not usable.all():
-        notes.append(f"{path.name}: {np.sum(~usable)} rows with a missing force are not scored")
-        newtons[~usable] = np.nan
+                message += f"; {name} is empty in {empty.sum()} of {len(empty)} rows, first in row {row:.0f}"
+        raise UserError(message)
+    if not is_usable.all():
+        notes.append(f"{path.name}: {np.sum(~is_usable)} rows with a missing force are not scored")
+        newtons[~is_usable] = np.nan
     largest = float(np.nanmax(np.abs(newtons)))
     if largest > _LARGEST_FORCE_N and about.tissue != "phantom":
         raise UserError(

@@ -41,26 +41,28 @@ def find_scale(meta: Meta, folder: Path, pictures: Callable[[], Iterator[Picture
     found, points that coincide, or no picture.
     """
     if meta.scale_mm_per_px == "unknown":
-        wide = next(pictures()).rgb.shape[1]
+        width = next(pictures()).rgb.shape[1]
         source = f"unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
-        found = PixelScale(pixel_mm("unknown", wide), _UNKNOWN, source)
+        scale = PixelScale(pixel_mm("unknown", width), _UNKNOWN, source)
     elif meta.scale_mm_per_px is not None:
-        found = PixelScale(meta.scale_mm_per_px, _STATED, "stated")
+        scale = PixelScale(meta.scale_mm_per_px, _STATED, "stated")
     else:
         assert meta.calibration is not None
-        found = _calibrated(meta.calibration, folder)
-    return found if meta.scale_uncertainty is None else replace(found, uncertainty=meta.scale_uncertainty)
+        scale = _calibrate(meta.calibration, folder)
+    return scale if meta.scale_uncertainty is None else replace(scale, uncertainty=meta.scale_uncertainty)
 
 
-def _calibrated(way: ScaleCalibration, folder: Path) -> PixelScale:
-    if way.focal_px is not None and way.distance_mm is not None:
-        return PixelScale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
-    if way.bar_px is not None and way.bar_mm is not None:
-        return _bar(way.bar_px, way.bar_mm)
-    assert way.checkerboard is not None
-    assert way.corners is not None
-    assert way.square_mm is not None
-    return _checkerboard(folder / way.checkerboard, way.corners, way.square_mm)
+def _calibrate(calibration: ScaleCalibration, folder: Path) -> PixelScale:
+    if calibration.focal_px is not None and calibration.distance_mm is not None:
+        return PixelScale(
+            calibration.distance_mm / calibration.focal_px, _DISTANCE, "focal length and working distance"
+        )
+    if calibration.bar_px is not None and calibration.bar_mm is not None:
+        return _bar(calibration.bar_px, calibration.bar_mm)
+    assert calibration.checkerboard is not None
+    assert calibration.corners is not None
+    assert calibration.square_mm is not None
+    return _checkerboard(folder / calibration.checkerboard, calibration.corners, calibration.square_mm)
 
 
 def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float) -> PixelScale:
@@ -74,13 +76,13 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Pix
     """Scale by the mean length of the squares' sides; their spread, by tilt and distortion, is its error."""
     columns, rows = corners
     grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
-    found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
-    if not found:
+    is_found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
+    if not is_found:
         raise UserError(f"{path}: no checkerboard of {columns} x {rows} inner corners found")
     grid = np.asarray(points, np.float64).reshape(rows, columns, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)]
-    middle = float((lengths := np.concatenate(sides)).mean())
+    mean_px = float((lengths := np.concatenate(sides)).mean())
     # Under tilt sides along rows and columns differ: half that difference is a systematic error.
     tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
-    error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
-    return PixelScale(square_mm / middle, max(error, 1e-4), "checkerboard")
+    error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / mean_px
+    return PixelScale(square_mm / mean_px, max(error, 1e-4), "checkerboard")

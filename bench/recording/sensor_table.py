@@ -122,43 +122,45 @@ def read_forces(path: Path, columns: str = "", since_1970: bool = False) -> Read
     has both. Known are three axes, one, or a size; units in names, in a row below or in the head.
     UserError: no such columns, a unit that is none of force, or a cell that can't be read.
     """
-    table = _with_names(path, columns) if columns else _with_header(path, _count_forces)
+    table = _split_by_names(path, columns) if columns else _split_by_header(path, _count_forces)
     notes = list[str]()
     if table.head and not columns:
         notes.append(f"{path}: {len(table.head)} lines before the header are left out")
-    chosen = find_force_columns(table)
-    values = table.numbers(*chosen.values())
-    for name, k, column in zip(chosen, chosen.values(), values, strict=True):
+    column_by_axis = find_force_columns(table)
+    values = table.numbers(*column_by_axis.values())
+    for name, k, column in zip(column_by_axis, column_by_axis.values(), values, strict=True):
         column[~np.isfinite(column)] = np.nan
         if np.isnan(column).all():
             raise table.error(f"column {table.names[k] or name} holds no number")
-    factors = [_newtons(table, k) for k in chosen.values()]
+    factors = [_newtons(table, k) for k in column_by_axis.values()]
     if len({factor is None for factor in factors}) > 1:
         raise table.error(
             "some of the columns of force state a unit, others don't: name them by --use columns="
         )
     force = np.zeros((len(table.rows), 3))
-    for axis, column, factor in zip(chosen, values, factors, strict=True):
+    for axis, column, factor in zip(column_by_axis, values, factors, strict=True):
         force[:, "xyz".find(axis) if axis in ("x", "y", "z") else 0] = column * (factor or 1.0)
-    axes = "".join(axis for axis in chosen if axis in "xyz") if "size" not in chosen else ""
+    axes = "".join(axis for axis in column_by_axis if axis in "xyz") if "size" not in column_by_axis else ""
     if axes != "xyz":
-        which = f"force along {' and '.join(axes)} alone" if axes else "a size of force without a direction"
-        names = ", ".join(table.names[k] for k in chosen.values())
-        notes.append(f"{path}: holds {which} ({names}): only the size is scored")
-    stated = {
+        description = (
+            f"force along {' and '.join(axes)} alone" if axes else "a size of force without a direction"
+        )
+        names = ", ".join(table.names[k] for k in column_by_axis.values())
+        notes.append(f"{path}: holds {description} ({names}): only the size is scored")
+    stated_units = {
         table.units[k] or "its head"
-        for k, f in zip(chosen.values(), factors, strict=True)
+        for k, f in zip(column_by_axis.values(), factors, strict=True)
         if f not in (None, 1)
     }
-    if stated:
-        notes.append(f"{path}: converted to newtons from {', '.join(sorted(stated))}")
+    if stated_units:
+        notes.append(f"{path}: converted to newtons from {', '.join(sorted(stated_units))}")
     if factors[0] is None:
         notes.append(
             f"{path}: states no unit of force: it is taken for newtons unless --newtons says otherwise"
         )
     time_s = read_times(table, since_1970, notes)
-    down = [table.names.index(name) for name in ("gx", "gy", "gz") if table.names.count(name) == 1]
-    gravity = np.stack(table.numbers(*down), axis=1) if len(down) == 3 else None
+    gravity_columns = [table.names.index(name) for name in ("gx", "gy", "gz") if table.names.count(name) == 1]
+    gravity = np.stack(table.numbers(*gravity_columns), axis=1) if len(gravity_columns) == 3 else None
     return Readings(time_s, force, axes, factors[0] is not None, tuple(notes), gravity)
 
 
@@ -179,21 +181,21 @@ def find_bias(force: Floats) -> str:
 
 def find_force_columns(table: SensorTable) -> dict[str, int]:
     """Column of each axis, `x`, `y`, `z`, or of `size`. UserError: none, or several."""
-    for before in ("", r"(?:.*\.)", r"(?:.*[._ ])"):
-        found = {}
+    for prefix in ("", r"(?:.*\.)", r"(?:.*[._ ])"):
+        columns = {}
         for axis in "xyz":
-            match = [
-                k for k, name in enumerate(table.names) if re.fullmatch(before + _AXIS.format(axis), name)
+            matches = [
+                k for k, name in enumerate(table.names) if re.fullmatch(prefix + _AXIS.format(axis), name)
             ]
-            if len(match) > 1:
-                names = ", ".join(table.names[k] for k in match)
+            if len(matches) > 1:
+                names = ", ".join(table.names[k] for k in matches)
                 raise table.error(
                     f"several columns of force along {axis} ({names}): name one by --use columns="
                 )
-            if match:
-                found[axis] = match[0]
-        if found:
-            return found
+            if matches:
+                columns[axis] = matches[0]
+        if columns:
+            return columns
     sizes = [k for k, name in enumerate(table.names) if re.fullmatch(_SIZE, name)]
     shears = [k for k, name in enumerate(table.names) if re.fullmatch(_SHEAR, name)]
     if len(sizes) == 1 and len(shears) == 1 and "normal" in table.names[sizes[0]]:
@@ -215,9 +217,11 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
     if stamps:
         (values,) = table.numbers(stamps[0])
         if np.nanmax(values, initial=0.0) > 0:
-            rest = [k for k, name in enumerate(table.names) if re.fullmatch(_NANOSECONDS, name)]
-            more = 1e-9 * table.numbers(rest[0])[0] if rest else 0.0
-            candidates[table.names[stamps[0]]] = (values if rest else _scaled(values, "")) + more
+            nanoseconds = [k for k, name in enumerate(table.names) if re.fullmatch(_NANOSECONDS, name)]
+            fraction_s = 1e-9 * table.numbers(nanoseconds[0])[0] if nanoseconds else 0.0
+            candidates[table.names[stamps[0]]] = (
+                values if nanoseconds else _to_seconds(values, "")
+            ) + fraction_s
     columns = [k for k, name in enumerate(table.names) if re.fullmatch(_TIME, name)]
     counters, unknown = list[str](), list[str]()
     for k in columns if not candidates else ():
@@ -226,8 +230,8 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
             unknown.append(f"{table.names[k]} is in {table.units[k]!r}, which is no unit of time")
             continue
         values = _clock(table, k, notes)
-        is_whole = bool((np.diff(values) == 1).all() and (values == np.round(values)).all())
-        (counters.append(table.names[k]) if is_whole and not table.units[k] else None)
+        is_counter = bool((np.diff(values) == 1).all() and (values == np.round(values)).all())
+        (counters.append(table.names[k]) if is_counter and not table.units[k] else None)
         candidates[table.names[k]] = values
     for name in [*dict.fromkeys(counters)][: len(candidates) - 1]:
         candidates.pop(name)  # the number of a row, next to a clock
@@ -235,10 +239,12 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
         raise table.error(f"{unknown[0]}: name the columns by --use columns=t_s,fx_n,... or convert it")
     if not candidates:
         return _even_times(table, notes)
-    right_kind = [
-        name for name, v in candidates.items() if (np.nanmax(v, initial=0) > SINCE_1970_S) == since_1970
+    preferred = [
+        name
+        for name, values in candidates.items()
+        if (np.nanmax(values, initial=0) > SINCE_1970_S) == since_1970
     ]
-    name = next(iter(right_kind or candidates))
+    name = next(iter(preferred or candidates))
     others = [table.names[k] for k in (*stamps, *columns) if table.names[k] != name]
     if others:
         notes.append(f"{table.path}: times are those of {name}, not {', '.join(others)}")
@@ -254,21 +260,21 @@ def spread_blocks(time_s: Floats, path: Path, notes: list[str]) -> Floats:
     lengths = np.diff(np.append(-1, ends))[1:-1]
     if len(lengths) < 2 or np.median(lengths) < _LEAST_BLOCK:
         return time_s
-    middle = float(np.median(lengths))
-    if np.abs(lengths - middle).mean() > _BLOCK_SPREAD * middle or (np.diff(stamps[ends]) <= 0).any():
+    median = float(np.median(lengths))
+    if np.abs(lengths - median).mean() > _BLOCK_SPREAD * median or (np.diff(stamps[ends]) <= 0).any():
         return time_s
     step = (stamps[ends[-2]] - stamps[ends[0]]) / (ends[-2] - ends[0])
     # The last of a block is at its stamp; the first and the last block may not be whole.
-    at, of = ends[:-1], stamps[ends[:-1]]
-    places = np.arange(len(stamps))
-    even = np.interp(places, at, of)
-    even = np.where(places < at[0], of[0] + (places - at[0]) * step, even)
-    even = np.where(places > at[-1], of[-1] + (places - at[-1]) * step, even)
+    knots, knots_s = ends[:-1], stamps[ends[:-1]]
+    positions = np.arange(len(stamps))
+    even_s = np.interp(positions, knots, knots_s)
+    even_s = np.where(positions < knots[0], knots_s[0] + (positions - knots[0]) * step, even_s)
+    even_s = np.where(positions > knots[-1], knots_s[-1] + (positions - knots[-1]) * step, even_s)
     out = time_s.copy()
-    out[known] = even
+    out[known] = even_s
     notes.append(
-        f"{path}: {middle:g} samples share each stamp: spread evenly up to it; they may be "
-        f"{1000 * middle * step:.3g} ms early or late"
+        f"{path}: {median:g} samples share each stamp: spread evenly up to it; they may be "
+        f"{1000 * median * step:.3g} ms early or late"
     )
     return out
 
@@ -278,7 +284,7 @@ def _clock(table: SensorTable, k: int, notes: list[str]) -> Floats:
     (cells,) = table.columns(k)
     dates = [j for j, name in enumerate(table.names) if name in ("date", "day", "datum")]
     if not clock_text.is_clock(cells):
-        return _scaled(table.numbers(k)[0], table.units[k])
+        return _to_seconds(table.numbers(k)[0], table.units[k])
     if dates and not any(re.search(r"\d[-/.]\d+[-/.]\d", cell) for cell in cells[:1]):
         (days,) = table.columns(dates[0])
         cells = [
@@ -288,11 +294,11 @@ def _clock(table: SensorTable, k: int, notes: list[str]) -> Floats:
     return clock_text.parse_clock(table.path, cells, table.lines, notes)
 
 
-def _scaled(values: Floats, unit: str) -> Floats:
+def _to_seconds(values: Floats, unit: str) -> Floats:
     """Numbers of a clock as seconds: by a stated unit, else by those that are since 1970, or days."""
     if (factor := _SECONDS.get(unit.lower())) is not None:
         return values * factor
-    least, most = SINCE_1970_S, _LATEST_S
+    earliest, latest = SINCE_1970_S, _LATEST_S
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     steps = np.abs(np.diff(values[np.isfinite(values)]))
     if (
@@ -301,24 +307,26 @@ def _scaled(values: Floats, unit: str) -> Floats:
         and 0 < np.median(steps[steps > 0] if steps.any() else steps) < _FASTEST_S
     ):
         return (values - _DAYS_TO_1970) * 86400.0
-    return values * next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if least < largest * u < most), 1.0)
+    return values * next(
+        (unit_s for unit_s in (1.0, 1e-3, 1e-6, 1e-9) if earliest < largest * unit_s < latest), 1.0
+    )
 
 
 def _even_times(table: SensorTable, notes: list[str]) -> Floats:
     """Times by the rate that the head states. UserError: no column of times, and no rate, or several."""
-    hertz = _head_number(table, _HEAD_RATE)
-    if step_s := _head_number(table, _HEAD_STEP):
+    hertz = _find_head_number(table, _HEAD_RATE)
+    if step_s := _find_head_number(table, _HEAD_STEP):
         hertz = 1 / step_s
     if not 0 < hertz < np.inf:
         raise table.error(
-            f"no column of times; the columns are {_shown(table.names)}: name it by --use "
+            f"no column of times; the columns are {_list_names(table.names)}: name it by --use "
             "columns=t_s,fx_n,..."
         )
     notes.append(f"{table.path}: no column of times: {hertz:g} samples per second, as its head states")
     return np.arange(len(table.rows)) / hertz
 
 
-def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
+def _find_head_number(table: SensorTable, label: re.Pattern[str]) -> float:
     """The number that the head states after a label, a thousand times it if in kHz; 0: none.
 
     UserError: several numbers that differ, or one that can't be read.
@@ -328,8 +336,8 @@ def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
         if (match := label.search(line)) is None:
             continue
         text = _PER_SECOND.sub(" Hz ", line[match.end() :])
-        name, *rest = re.split("[:=]", text, maxsplit=1)
-        value = (rest[0] if rest else _BRACKETS.sub(" ", name)).lstrip(' "')
+        name, *tail = re.split("[:=]", text, maxsplit=1)
+        value = (tail[0] if tail else _BRACKETS.sub(" ", name)).lstrip(' "')
         # The comma of "rate,500,500" parts cells, that of "rate: 1,500 Hz" thousands.
         cells = next(csv.reader([value]), []) if value.startswith(",") else [value]
         numbers = [word.rstrip(".,'’") for cell in cells for word in _HEAD_NUMBER.findall(cell)]
@@ -340,20 +348,20 @@ def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
             raise table.error(f"a rate in a unit of time: {lines[-1]!r}: write it as 'Sampling rate: 500 Hz'")
         factor = 1000.0 if "khz" in text.lower() else 1.0
         try:
-            stated = {number: factor * _stated_number(number) for number in numbers}
+            stated_values = {number: factor * _parse_number(number) for number in numbers}
         except ValueError:
             raise table.error(f"{lines[-1]!r} states no number that can be read") from None
-        for number, value in stated.items():
+        for number, value in stated_values.items():
             # "500,500" and "500,1000" are two rates as well as one.
             if label is _HEAD_RATE and (_TWO_NUMBERS.fullmatch(number) or value > _FASTEST_HZ):
                 raise table.error(f"{lines[-1]!r}: one rate or two? write it as 'Sampling rate: 500 Hz'")
-        values |= set(stated.values())
+        values |= set(stated_values.values())
     if len(values) > 1:
         raise table.error(f"which number is meant can't be told: {' | '.join(lines)}: leave one")
     return values.pop() if values else 0.0
 
 
-def _stated_number(text: str) -> float:
+def _parse_number(text: str) -> float:
     """A number of a head, where commas are thousands if they can be. ValueError: it is none."""
     try:
         return csv_table.parse_number(text, ".")
@@ -380,13 +388,13 @@ def _newtons(table: SensorTable, k: int) -> float | None:
 
 def read_clock(path: Path, notes: list[str]) -> tuple[Floats, Floats | None]:
     """Times (N,) s of a table of pictures, and its column `frame` (N,) if it has one. UserError: no times."""
-    table = _with_header(path, _count_times)
+    table = _split_by_header(path, _count_times)
     time_s = read_times(table, True, notes)
     frames = [k for k, name in enumerate(table.names) if name == "frame"]
     return time_s, table.numbers(frames[0])[0] if frames else None
 
 
-def _with_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTable:
+def _split_by_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTable:
     """The table below the line, among the first, in which most names are known. UserError: there is none."""
     lines = csv_table.read_lines(path)
     best: tuple[int, int, Callable[[str], list[str]]] | None = None
@@ -394,7 +402,7 @@ def _with_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTab
         for split in _splitters(line):
             names = [_name(cell)[0] for cell in _header_cells(line, split)]
             score = count(names)
-            if score and score > (best[0] if best else 0) and _goes_on(lines, k, split, names):
+            if score and score > (best[0] if best else 0) and _has_numbers_below(lines, k, split, names):
                 best = (score, k, split)
     if best is None:
         first = next((line for line in lines if line.strip()), "")
@@ -402,44 +410,44 @@ def _with_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTab
         raise (
             _no_columns(path, names or [first])
             if count is _count_forces
-            else UserError(f"{path}: no column of times; it begins with {_shown(names or [first])}")
+            else UserError(f"{path}: no column of times; it begins with {_list_names(names or [first])}")
         )
-    _, at, split = best
-    pairs = [_name(cell) for cell in _header_cells(lines[at], split)]
+    _, header, split = best
+    pairs = [_name(cell) for cell in _header_cells(lines[header], split)]
     names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
-    rows, numbers = _rows(lines, at + 1, split)
+    rows, numbers = _rows(lines, header + 1, split)
     if rows and (below := _units_row(rows[0])) is not None:
-        units = [there or unit for unit, there in zip(units, [*below, *[""] * len(units)], strict=False)]
+        units = [label or unit for unit, label in zip(units, [*below, *[""] * len(units)], strict=False)]
         rows, numbers = rows[1:], numbers[1:]
-    head = [line for line in lines[:at] if line.strip()]
-    return _checked(SensorTable(path, names, units, rows, numbers, head))
+    head = [line for line in lines[:header] if line.strip()]
+    return _check_width(SensorTable(path, names, units, rows, numbers, head))
 
 
-def _with_names(path: Path, columns: str) -> SensorTable:
+def _split_by_names(path: Path, columns: str) -> SensorTable:
     """A table with given names; rows before the first with numbers in the named columns are left out."""
     pairs = [("", "") if name.strip() == "-" else _name(name) for name in columns.split(",")]
-    named = [k for k, (name, _) in enumerate(pairs) if name]
+    named_columns = [k for k, (name, _) in enumerate(pairs) if name]
     lines = csv_table.read_lines(path)
-    for at, line in enumerate(lines[:_HEAD_LINES]):
+    for first, line in enumerate(lines[:_HEAD_LINES]):
         for split in _splitters(line):
             cells = split(line)
-            if len(cells) >= len(pairs) and all(_is_value(cells[k]) for k in named):
-                rows, numbers = _rows(lines, at, split)
+            if len(cells) >= len(pairs) and all(_is_value(cells[k]) for k in named_columns):
+                rows, numbers = _rows(lines, first, split)
                 names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
-                return _checked(SensorTable(path, names, units, rows, numbers, lines[:at]))
+                return _check_width(SensorTable(path, names, units, rows, numbers, lines[:first]))
     raise UserError(
-        f"{path}: no row has numbers in the {len(named)} columns named by --use columns={columns}"
+        f"{path}: no row has numbers in the {len(named_columns)} columns named by --use columns={columns}"
     )
 
 
-def _checked(table: SensorTable) -> SensorTable:
+def _check_width(table: SensorTable) -> SensorTable:
     """The table. UserError: no rows, or one with more cells than names; `columns` refuses too few."""
     if not table.rows:
         raise table.error("a header but no rows")
     width = len(table.names)
     for line, row in zip(table.lines, table.rows, strict=True):
-        over = "." not in "".join(row) and "".join(row[width:]).strip()
-        if over:
+        excess = "." not in "".join(row) and "".join(row[width:]).strip()
+        if excess:
             fault = f"{len(row)} cells, {width} expected (decimal commas? use points)"
             raise UserError(f"{table.path}:{line}: {fault}")
     return table
@@ -459,13 +467,13 @@ def _rows(
 
 def _splitters(line: str) -> list[Callable[[str], list[str]]]:
     """Ways to split a line that give several cells; or one, if it holds no mark."""
-    found: list[Callable[[str], list[str]]] = [_by(mark) for mark in ";\t,|" if mark in line]
+    splitters: list[Callable[[str], list[str]]] = [_split_at(mark) for mark in ";\t,|" if mark in line]
     if not any(mark in line for mark in ";\t") and len(line.split()) > 1:
-        found.append(_by_space)
-    return found or [_by(",")]
+        splitters.append(_split_at_space)
+    return splitters or [_split_at(",")]
 
 
-def _by(mark: str) -> Callable[[str], list[str]]:
+def _split_at(mark: str) -> Callable[[str], list[str]]:
     def split(line: str) -> list[str]:
         try:
             return next(csv.reader([line], delimiter=mark, skipinitialspace=True), [])
@@ -475,7 +483,7 @@ def _by(mark: str) -> Callable[[str], list[str]]:
     return split
 
 
-def _by_space(line: str) -> list[str]:
+def _split_at_space(line: str) -> list[str]:
     return line.split()
 
 
@@ -483,7 +491,7 @@ def _header_cells(line: str, split: Callable[[str], list[str]]) -> list[str]:
     """The names in a header, which may be a comment; a unit in brackets belongs to the name before it."""
     text, joined = line.strip().lstrip("#%/ ") if line.lstrip().startswith(("#", "//")) else line, list[str]()
     for cell in split(text):
-        if split is _by_space and joined and re.fullmatch(r"[\[(].*", cell):
+        if split is _split_at_space and joined and re.fullmatch(r"[\[(].*", cell):
             joined[-1] += cell
         else:
             joined.append(cell)
@@ -521,18 +529,22 @@ def _count_forces(names: Sequence[str]) -> int:
     return (2 * axes or sizes) and 2 * axes + sizes + times
 
 
-def _goes_on(lines: Sequence[str], at: int, split: Callable[[str], list[str]], names: Sequence[str]) -> bool:
+def _has_numbers_below(
+    lines: Sequence[str], header: int, split: Callable[[str], list[str]], names: Sequence[str]
+) -> bool:
     """Whether one of the next rows has numbers where a header's columns of force are."""
     table = SensorTable(Path(), list(names), [""] * len(names), [], [])
     try:
-        chosen = [*find_force_columns(table).values()]
+        columns = [*find_force_columns(table).values()]
     except UserError:  # several, which is reported later
-        chosen = []
+        columns = []
     rows = [
-        line for line in lines[at + 1 : at + 20] if line.strip() and not line.lstrip().startswith(_COMMENT)
+        line
+        for line in lines[header + 1 : header + 20]
+        if line.strip() and not line.lstrip().startswith(_COMMENT)
     ]
     return any(
-        len(cells := split(line)) > max(chosen, default=0) and all(_is_value(cells[k]) for k in chosen)
+        len(cells := split(line)) > max(columns, default=0) and all(_is_value(cells[k]) for k in columns)
         for line in rows[:3]
     )
 
@@ -553,10 +565,10 @@ def _is_value(cell: str) -> bool:
 
 def _no_columns(path: Path, names: Sequence[str]) -> UserError:
     return UserError(
-        f"{path}: no column of force; it begins with {_shown(names)}: name the columns in order by "
+        f"{path}: no column of force; it begins with {_list_names(names)}: name the columns in order by "
         "--use columns=t_s,fx_n,fy_n,fz_n (f_n for a size, - for others)"
     )
 
 
-def _shown(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     return ", ".join(names)[:160]

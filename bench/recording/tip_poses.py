@@ -32,39 +32,39 @@ class TipPrior:
         poses = self.poses.get(index)
         if not poses:
             return None
-        drawn = np.zeros(size, np.uint8)
+        canvas = np.zeros(size, np.uint8)
         for pose in poses:
             ends = np.array([pose[:3, 3]])
             if self.axis is not None:
                 steps = np.linspace(0, _SHAFT_MM, 32)[:, None] * (pose[:3, :3] @ self.axis)
                 ends = pose[:3, 3] + steps
-            places = self.projection @ np.column_stack([ends, np.ones(len(ends))]).T
-            seen = places[2] > 0
-            line = (places[:2, seen] / places[2, seen]).T
+            projected = self.projection @ np.column_stack([ends, np.ones(len(ends))]).T
+            in_front = projected[2] > 0
+            line = (projected[:2, in_front] / projected[2, in_front]).T
             line = line[(np.abs(line) < 10 * max(size)).all(axis=1)]
             if len(line):
                 width = max(round(2 * self.radius_px), 1)
                 corners = np.rint(line).astype(np.int32)
-                cv2.polylines(drawn, [corners], False, 1, width)
-                cv2.circle(drawn, corners[0].tolist(), width // 2, 1, -1)
-        return drawn > 0
+                cv2.polylines(canvas, [corners], False, 1, width)
+                cv2.circle(canvas, corners[0].tolist(), width // 2, 1, -1)
+        return canvas > 0
 
 
 def read_tips(path: Path, tips: Tips, mm_per_px: float) -> TipPrior:
     """The poses in a poses.csv as `bench import` writes it. UserError: it is missing, or holds none."""
     names = csv_table.read_header(path)
     tools = [name.removesuffix("_r33") for name in names if name.endswith("_r33")]
-    chosen = [name for name in tools if all(f"{name}_{part}" in names for part in _PARTS)]
+    used_tools = [name for name in tools if all(f"{name}_{part}" in names for part in _PARTS)]
     if tips.names:
-        wanted = [name.lower() for name in tips.names]  # as headers are read
-        if missing := set(wanted) - set(chosen):
-            raise UserError(f"{path}: no pose {min(missing)}; there are {', '.join(chosen) or 'none'}")
-        chosen = wanted
-    if not chosen:
+        lower_names = [name.lower() for name in tips.names]  # as headers are read
+        if missing := set(lower_names) - set(used_tools):
+            raise UserError(f"{path}: no pose {min(missing)}; there are {', '.join(used_tools) or 'none'}")
+        used_tools = lower_names
+    if not used_tools:
         raise UserError(f"{path}: holds no poses (columns NAME_x ... NAME_r33)")
-    parts = [f"{name}_{part}" for name in chosen for part in _PARTS]
+    parts = [f"{name}_{part}" for name in used_tools for part in _PARTS]
     columns = csv_table.read_csv(path, ["frame", *parts])
-    values = np.column_stack([columns[name] for name in parts]).reshape(-1, len(chosen), len(_PARTS))
+    values = np.column_stack([columns[name] for name in parts]).reshape(-1, len(used_tools), len(_PARTS))
     poses = dict[int, list[Floats]]()
     for number, rows in zip(columns["frame"], values, strict=True):
         for row in rows[np.isfinite(rows).all(axis=1)] if np.isfinite(number) else ():

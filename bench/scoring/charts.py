@@ -46,19 +46,19 @@ def draw_force(result: Result, others: bool = False) -> str:
         if sensor is not None:
             axes.plot(time_s, sensor, color=_SENSOR, linewidth=1.8, label="sensor", zorder=4)
         axes.plot(time_s, main, color=_MAIN, linewidth=1.8, label=result.main, zorder=5)
-        thin = {name: curve for name, curve in curves.items() if others and name != result.main}
+        thin_curves = {name: curve for name, curve in curves.items() if others and name != result.main}
         networks = result.settings.get("networks", {})
-        sizes = {name for name in thin if result.methods[name].gain}
-        for k, (name, curve) in enumerate(thin.items()):
+        sizes = {name for name in thin_curves if result.methods[name].gain}
+        for k, (name, curve) in enumerate(thin_curves.items()):
             # The gain of a length of flow is fitted to a curve that is drawn too: dotted.
-            line, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
-            axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
-        held = [curve for name, curve in thin.items() if name in sizes or name in networks]
+            style, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
+            axes.plot(time_s, curve, style, color=colour, linewidth=1.1, label=name)
+        ranged_curves = [curve for name, curve in thin_curves.items() if name in sizes or name in networks]
         if not others and result.absolute and method.high_mn is not None:
-            held.append(method.high_mn)
-        shown = np.concatenate([main, *held, *([] if sensor is None else [sensor])])
-        if np.isfinite(shown).any():
-            low, high = min(np.nanmin(shown), 0.0), _largest(shown)
+            ranged_curves.append(method.high_mn)
+        values = np.concatenate([main, *ranged_curves, *([] if sensor is None else [sensor])])
+        if np.isfinite(values).any():
+            low, high = min(np.nanmin(values), 0.0), _largest(values)
             axes.set_ylim(low - 0.04 * (high - low), high + 0.08 * (high - low))
         for left in np.flatnonzero(result.lost[:-1] | result.lost[1:]):
             axes.axvspan(time_s[left], time_s[left + 1], color=_RED, alpha=0.1, linewidth=0)

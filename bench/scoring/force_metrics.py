@@ -49,8 +49,8 @@ def agreement(sensor: Floats, predicted: Floats) -> dict[str, float]:
     """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2, gain over samples (T,) mN where both are finite."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
-    found = metrics.agreement(metrics.moments(x, y))
-    scores = {key: found[name] for name, key in _AGREEMENT.items()}
+    values = metrics.agreement(metrics.moments(x, y))
+    scores = {key: values[name] for name, key in _AGREEMENT.items()}
     return {"n": float(len(x)), **scores, "gain": metrics.line(x, y)[0]}
 
 
@@ -61,10 +61,10 @@ def agreement_intervals(sensor: Floats, predicted: Floats, rng: np.random.Genera
     x, y = sensor[good], predicted[good]
     if len(x) < bootstrap.LEAST_SAMPLES:
         return {}
-    block = max(bootstrap.block_length(one) for one in (x, y, y - x))
+    block = max(bootstrap.block_length(series) for series in (x, y, y - x))
     pairs = np.column_stack([np.ones_like(x), x, y, x**2, y**2, x * y, np.abs(y - x)])
-    drawn = metrics.agreements(bootstrap.counts(len(x), block, bootstrap.RESAMPLES, rng) @ pairs)
-    return {key: bootstrap.interval(drawn[name]) for name, key in _AGREEMENT.items()}
+    resampled = metrics.agreements(bootstrap.counts(len(x), block, bootstrap.RESAMPLES, rng) @ pairs)
+    return {key: bootstrap.interval(resampled[name]) for name, key in _AGREEMENT.items()}
 
 
 def difference_interval(sensor: Floats, first: Floats, second: Floats, rng: np.random.Generator) -> Interval:
@@ -126,10 +126,10 @@ def events(time_s: Floats, contact: Mask, shortest_s: float = 0.15) -> list[slic
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
     first, last = edges[::2], edges[1::2] - 1
-    apart = time_s[first[1:]] - time_s[last[:-1]] - step >= shortest_s
-    first, last = first[np.append(True, apart)[: len(first)]], last[np.append(apart, True)[: len(last)]]
-    long = time_s[last] - time_s[first] + step >= shortest_s
-    return [slice(int(a), int(b) + 1) for a, b in zip(first[long], last[long], strict=True)]
+    is_apart = time_s[first[1:]] - time_s[last[:-1]] - step >= shortest_s
+    first, last = first[np.append(True, is_apart)[: len(first)]], last[np.append(is_apart, True)[: len(last)]]
+    is_long = time_s[last] - time_s[first] + step >= shortest_s
+    return [slice(int(a), int(b) + 1) for a, b in zip(first[is_long], last[is_long], strict=True)]
 
 
 def per_event(
@@ -138,11 +138,11 @@ def per_event(
     """A row per contact: times, peak [mN] and impulse [mN s] (trapezoidal) of the sensor, and the errors over
     the samples with a prediction, NaN for fewer than two."""
     rows = []
-    for part in spans:
-        known = np.isfinite(sensor[part])
+    for span in spans:
+        known = np.isfinite(sensor[span])
         if known.sum() < 2:
             continue
-        t, x, y = time_s[part][known], sensor[part][known], predicted[part][known]
+        t, x, y = time_s[span][known], sensor[span][known], predicted[span][known]
         row = {"from_s": t[0], "to_s": t[-1], "peak_mn": x.max(), "impulse_mns": np.trapezoid(x, t)}
         both = np.isfinite(y)
         if both.sum() > 1:  # else the errors are NaN
@@ -159,12 +159,16 @@ def per_event(
 def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> dict[str, float]:
     """Scores of contact detection, as `METRICS` describes them."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
-    truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
-    free, hits, named = ~truth, int((truth & found).sum()), int(truth.sum() + found.sum())
+    contact, detected = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
+    free, hits, total = (
+        ~contact,
+        int((contact & detected).sum()),
+        int(contact.sum() + detected.sum()),
+    )
     return {
         # By its definition: importing scikit-learn for it took a fifth of the start of every command.
-        "contact_f1": 2 * hits / named if named else math.nan,
-        "false_positive_rate": float(found[free].mean()) if free.any() else math.nan,
+        "contact_f1": 2 * hits / total if total else math.nan,
+        "false_positive_rate": float(detected[free].mean()) if free.any() else math.nan,
     }
 
 
@@ -183,8 +187,8 @@ def compute_all(
     scores = agreement(sensor, predicted)
     peak = _mean_size(rows, "peak_mn")
     # The error after the best gain, known only in hindsight, is that of the curve's shape.
-    best = gain(sensor, predicted, np.isfinite(sensor)) * predicted
-    scores["shape_error"] = ratio(agreement(sensor, best)["mae_mn"], peak)
+    scaled = gain(sensor, predicted, np.isfinite(sensor)) * predicted
+    scores["shape_error"] = ratio(agreement(sensor, scaled)["mae_mn"], peak)
     scores |= contact_scores(sensor, predicted, threshold)
     scores |= {
         "lag_s": lag(time_s, sensor, predicted),
@@ -206,8 +210,8 @@ def without_newtons(scores: dict[str, float]) -> dict[str, float]:
 
 def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
     """The contacts with all values that require predicted newtons set to NaN."""
-    own = ("from_s", "to_s", "peak_mn", "impulse_mns")
-    return [{key: value if key in own else math.nan for key, value in row.items()} for row in rows]
+    sensor_keys = ("from_s", "to_s", "peak_mn", "impulse_mns")
+    return [{key: value if key in sensor_keys else math.nan for key, value in row.items()} for row in rows]
 
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:

@@ -39,7 +39,7 @@ class Headline:
 def headline(result: Result) -> Headline:
     """The main method's most important scores for this recording: first after the gain found on `press_s`,
     then those in newtons, or without E the scale-invariant ones. None if too many frames were lost."""
-    doubts = tuple(one.message for one in result.findings if one.severity == "warning")
+    doubts = tuple(finding.message for finding in result.findings if finding.severity == "warning")
     if result.refused:
         return Headline(result.refused, (), doubts)
     main = result.methods[result.main]
@@ -67,22 +67,22 @@ def _trust(result: Result) -> str:
     """One sentence on the assumed tissue and scale and, without findings, on frames and motion."""
     meta, network = result.settings["meta"], result.main
     parts = [] if result.findings else [f"None of {len(result.lost)} frames was lost"]
-    scored = result.methods.get(network)
+    method = result.methods.get(network)
     # Networks without intervals have no check of their training distribution.
-    if network in result.settings.get("networks", {}) and scored and scored.low_mn is not None:
+    if network in result.settings.get("networks", {}) and method and method.low_mn is not None:
         if any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes):
             parts.append("the motion is unlike that of the network's training data")
         elif parts:
             parts.append("the motion is like that of the network's training data")
     young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E = 1 kPa (unknown)"
-    assumed = [young + _within(meta.get("young_uncertainty", 0.0))]
-    guessed = meta.get("scale_mm_per_px") == "unknown"
-    scale = " (unknown)" if guessed else _within(result.scale.uncertainty)
-    assumed.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
-    assumed.append(f"membrane {meta.get('membrane', 'unknown')}")
-    parts.append(f"{'a' if parts else 'A'}ssumed: {', '.join(assumed)}")
+    assumptions = [young + _describe_error(meta.get("young_uncertainty", 0.0))]
+    is_guess = meta.get("scale_mm_per_px") == "unknown"
+    scale = " (unknown)" if is_guess else _describe_error(result.scale.uncertainty)
+    assumptions.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
+    assumptions.append(f"membrane {meta.get('membrane', 'unknown')}")
+    parts.append(f"{'a' if parts else 'A'}ssumed: {', '.join(assumptions)}")
     return "; ".join(parts) + "."
 
 
-def _within(uncertainty: float) -> str:
+def _describe_error(uncertainty: float) -> str:
     return f" ± {uncertainty:.0%}" if uncertainty else ""

@@ -34,7 +34,7 @@ _CALIBRATED = {
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """The score.json of each path (a file, or a folder of `bench score`). UserError for no path, a file of
     another kind, a recording twice, or main methods that differ."""
-    found = []
+    trees = []
     for path in paths:
         try:
             tree = checked_file.read_json(path / "score.json" if path.is_dir() else path)
@@ -43,57 +43,60 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
         if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
         check_format(tree.get("format_version", 1), SCORE, str(path))
-        found.append(tree)
-    if not found:
+        trees.append(tree)
+    if not trees:
         raise UserError("no scores to pool")
-    names = [tree["recording"] for tree in found]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise UserError(f"recording {min(twice)} is given twice")
-    if all(_fault(tree) for tree in found):
-        why = "; ".join(f"{tree['recording']}: {_fault(tree)}" for tree in found)
+    names = [tree["recording"] for tree in trees]
+    if duplicates := {name for name in names if names.count(name) > 1}:
+        raise UserError(f"recording {min(duplicates)} is given twice")
+    if all(_fault(tree) for tree in trees):
+        why = "; ".join(f"{tree['recording']}: {_fault(tree)}" for tree in trees)
         raise UserError(f"no recording can be pooled ({why})")
-    mains = {_identity(tree, tree["main"]): f"{tree['main']} of {tree['recording']}" for tree in found}
+    mains = {_identity(tree, tree["main"]): f"{tree['main']} of {tree['recording']}" for tree in trees}
     if len(mains) > 1:
-        differ = ", ".join(mains.values())
-        raise UserError(f"the main methods differ ({differ}): pool scores of one main method")
-    return found
+        main_names = ", ".join(mains.values())
+        raise UserError(f"the main methods differ ({main_names}): pool scores of one main method")
+    return trees
 
 
-def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def pool(trees: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means over the scored recordings, with 95% intervals over specimens, for methods that all have."""
-    every, found = found, [tree for tree in found if not _fault(tree)]
-    specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
-    main = found[0]["main"]
-    names = [{_identity(tree, name): name for name in tree["methods"]} for tree in found]
-    scored = [
-        {i: tree["methods"][name] for i, name in one.items()} for tree, one in zip(found, names, strict=True)
+    all_trees, trees = trees, [tree for tree in trees if not _fault(tree)]
+    specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in trees]
+    main = trees[0]["main"]
+    names = [{_identity(tree, name): name for name in tree["methods"]} for tree in trees]
+    method_rows = [
+        {i: tree["methods"][name] for i, name in by_identity.items()}
+        for tree, by_identity in zip(trees, names, strict=True)
     ]
-    common = [identity for identity in scored[0] if all(identity in one for one in scored)]
-    first = _identity(found[0], main)
+    common = [identity for identity in method_rows[0] if all(identity in row for row in method_rows)]
+    first = _identity(trees[0], main)
 
-    def values(method: str, part: str, key: str) -> Floats:
-        return np.array([one[method][part].get(key) for one in scored], np.float64)  # None: NaN
+    def gather(method: str, part: str, key: str) -> Floats:
+        return np.array([row[method][part].get(key) for row in method_rows], np.float64)  # None: NaN
 
     methods: dict[str, Any] = {}
     for identity in common:
         name = names[0][identity]
-        worse = values(first, "scores", "mae_mn") - values(identity, "scores", "mae_mn")
+        excess_mn = gather(first, "scores", "mae_mn") - gather(identity, "scores", "mae_mn")
         methods[name] = {
             "identity": identity,
-            "scores": {key: _mean(values(identity, "scores", key), specimens) for key in SCORES},
-            "calibrated": {key: _mean(values(identity, "calibrated", key), specimens) for key in _CALIBRATED},
-            "main_worse_by_mn": None if name == main else _mean(worse, specimens),
+            "scores": {key: _mean(gather(identity, "scores", key), specimens) for key in SCORES},
+            "calibrated": {key: _mean(gather(identity, "calibrated", key), specimens) for key in _CALIBRATED},
+            "main_worse_by_mn": None if name == main else _mean(excess_mn, specimens),
         }
     return {
         "format": "sulcus-pool",
         "version": 1,
         "main": main,
-        "recordings": [tree["recording"] for tree in found],
-        "left_out": {tree["recording"]: fault for tree in every if (fault := _fault(tree))},
-        "each": [_one_recording(tree) for tree in found],
-        "of_some": sorted({name for one in names for i, name in one.items() if i not in common}),
+        "recordings": [tree["recording"] for tree in trees],
+        "left_out": {tree["recording"]: fault for tree in all_trees if (fault := _fault(tree))},
+        "each": [_summarise_recording(tree) for tree in trees],
+        "of_some": sorted(
+            {name for by_identity in names for i, name in by_identity.items() if i not in common}
+        ),
         "specimens": len(set(specimens)),
-        "frames": sum(tree["frames"] for tree in found),
+        "frames": sum(tree["frames"] for tree in trees),
         "methods": methods,
     }
 
@@ -118,24 +121,24 @@ def _fault(tree: dict[str, Any]) -> str:
     return "" if tree["scores"] else "no sensor"
 
 
-def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
+def _summarise_recording(tree: dict[str, Any]) -> dict[str, Any]:
     """One recording's main scores and the alignment of its clocks."""
-    found = tree.get("sync") or {}
+    sync = tree.get("sync") or {}
     return {
         "recording": tree["recording"],
         "frames": tree["frames"],
         **{key: tree["scores"].get(key) for key in ("event_peak_mn", "mae_of_peak", "r")},
-        "offset_s": found.get("offset_s"),
-        "offset_deviation_s": found.get("deviation_s"),
+        "offset_s": sync.get("offset_s"),
+        "offset_deviation_s": sync.get("deviation_s"),
         "lost": (tree.get("lost") or {}).get("share"),
     }
 
 
 def _mean(values: Floats, specimens: Sequence[str]) -> dict[str, float | None]:
     """Mean of the finite values and its interval; None if undefined or from too few specimens."""
-    found = over_groups(values, specimens, np.random.default_rng(0))
-    mean: dict[str, float | None] = as_plain(replace(found, n=int(np.isfinite(values).sum())))
-    return mean
+    statistics = over_groups(values, specimens, np.random.default_rng(0))
+    plain: dict[str, float | None] = as_plain(replace(statistics, n=int(np.isfinite(values).sum())))
+    return plain
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
@@ -149,14 +152,14 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
 def page(tree: Mapping[str, Any]) -> str:
     """The page in Markdown; methods with a smaller error than the main one are marked."""
     methods, count = tree["methods"], f"{len(tree['recordings'])} recordings"
-    error = methods[tree["main"]]["scores"]["mae_mn"]["mean"]
+    main_error = methods[tree["main"]]["scores"]["mae_mn"]["mean"]
     rows = []
-    for name, found in methods.items():
-        better = None not in (error, own := found["scores"]["mae_mn"]["mean"]) and own < error
+    for name, method in methods.items():
+        better = None not in (main_error, error := method["scores"]["mae_mn"]["mean"]) and error < main_error
         row = {"method": f"{name} (better)" if better else name}
-        row |= {METRICS[key].heading: _text(found["scores"][key], METRICS[key].digits) for key in _SHOWN}
+        row |= {METRICS[key].heading: _text(method["scores"][key], METRICS[key].digits) for key in _SHOWN}
         row |= {
-            head: _text(found["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED.items()
+            head: _text(method["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED.items()
         }
         rows.append(row)
     parts = [
@@ -166,10 +169,10 @@ def page(tree: Mapping[str, Any]) -> str:
         if tree["specimens"] >= LEAST_GROUPS
         else f"Means over recordings, without intervals: those need at least {LEAST_GROUPS} specimens.",
         *(f"{name} is left out: not all recordings were scored with it." for name in tree["of_some"]),
-        *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
+        *(f"Recording {recording} is left out: {why}." for recording, why in tree["left_out"].items()),
         _table(rows),
         f"## By recording, {tree['main']}",
-        _table([_row(one) for one in tree["each"]]),
+        _table([_row(recording) for recording in tree["each"]]),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -180,18 +183,18 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 
 
-def _row(one: Mapping[str, Any]) -> dict[str, str]:
+def _row(recording: Mapping[str, Any]) -> dict[str, str]:
     """One recording's row of the table."""
-    known = {key: math.nan if value is None else value for key, value in one.items()}
-    offset = f"{1e3 * known['offset_s']:.0f} ± {1e3 * known['offset_deviation_s']:.0f}"
+    values = {key: math.nan if value is None else value for key, value in recording.items()}
+    offset = f"{1e3 * values['offset_s']:.0f} ± {1e3 * values['offset_deviation_s']:.0f}"
     return {
-        "recording": one["recording"],
-        "frames": str(one["frames"]),
-        "event peak [mN]": f"{known['event_peak_mn']:.2f}",
-        "MAE of peak": f"{known['mae_of_peak']:.1%}",
-        "r": f"{known['r']:.3f}",
-        "clocks' offset [ms]": "–" if one["offset_s"] is None else offset,
-    } | ({"lost": f"{one['lost']:.0%}"} if one.get("lost") is not None else {})
+        "recording": recording["recording"],
+        "frames": str(recording["frames"]),
+        "event peak [mN]": f"{values['event_peak_mn']:.2f}",
+        "MAE of peak": f"{values['mae_of_peak']:.1%}",
+        "r": f"{values['r']:.3f}",
+        "clocks' offset [ms]": "–" if recording["offset_s"] is None else offset,
+    } | ({"lost": f"{recording['lost']:.0%}"} if recording.get("lost") is not None else {})
 
 
 def _text(value: Mapping[str, float | None], digits: int) -> str:

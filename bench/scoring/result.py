@@ -35,7 +35,7 @@ class Gain:
 
 
 @dataclass(frozen=True)
-class Scored:
+class MethodScore:
     """One method on one recording."""
 
     force_mn: Floats  # (T, 3) camera axes [mN]
@@ -68,7 +68,7 @@ class Result:
     """(T,) magnitude at the frames' times [mN]."""
     sensor_axes_mn: Floats | None
     """(T, 3)."""
-    methods: dict[str, Scored]
+    methods: dict[str, MethodScore]
     scale: PixelScale
     relative_uncertainty: float
     """Relative standard deviation of every force from scale (force is proportional to its square) and E."""

@@ -12,7 +12,7 @@ from bench.methods import comparison
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
 from bench.methods.force_fusion import Fusion
 from bench.methods.method_interface import Method
-from bench.methods.method_plugins import Plugged
+from bench.methods.method_plugins import PluginMethod
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.recording.recording_folder import Recording, open_recording
@@ -73,58 +73,66 @@ def score(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(Path(recording))
-    if taken := {FUSION, MAIN} & set(methods or {}):
-        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
-    named = find_model(model) if isinstance(model, (str, Path)) else model
-    network = None if named is None else Model(named)
+    if reserved := {FUSION, MAIN} & set(methods or {}):
+        raise UserError(f"methods: the name {min(reserved)} is reserved; choose another")
+    source = find_model(model) if isinstance(model, (str, Path)) else model
+    network = None if source is None else Model(source)
     frames = len(recording.numbers) or None
     bar: AbstractContextManager[Progress]
     bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
     with ExitStack() as stack:
         if out is not None:
-            stack.enter_context(checked_file.made_folder(Path(out), _OUTPUT_BYTES))
-        flow, used = None, settings or Settings()
+            stack.enter_context(checked_file.open_folder(Path(out), _OUTPUT_BYTES))
+        flow, flow_settings = None, settings or Settings()
         # Another process is given an estimator by its name.
-        if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
+        if own_process and isinstance(flow_settings.backend, str) and (frames or _LONG) >= _LONG:
             flow = stack.enter_context(open_flow_process())
-        chosen = _choose_methods(network, methods or {}, baselines)
-        first = next(iter(chosen)) if main is None else main
-        if first not in chosen:
-            raise UserError(f"main {first}: no such method; one of {', '.join(chosen)}")
-        about = _describe(chosen)
-        with bar as done:
-            result = evaluate_recording(recording, chosen, first, recording.scale, used, about, done, flow)
+        selection = _choose_methods(network, methods or {}, baselines)
+        first = next(iter(selection)) if main is None else main
+        if first not in selection:
+            raise UserError(f"main {first}: no such method; one of {', '.join(selection)}")
+        description = _describe(selection)
+        with bar as advance:
+            result = evaluate_recording(
+                recording, selection, first, recording.scale, flow_settings, description, advance, flow
+            )
         if out is not None:
             write_result(result, Path(out), title)
     return result
 
 
-def _choose_methods(network: Model | None, own: Mapping[str, Method], baselines: bool) -> dict[str, Method]:
+def _choose_methods(
+    network: Model | None, further: Mapping[str, Method], baselines: bool
+) -> dict[str, Method]:
     """All methods by name, in the table's order."""
-    chosen: dict[str, Method] = {} if network is None else {MAIN: network}
-    for name, one in own.items():
-        chosen[name] = one if isinstance(one, Model) else Plugged(one, f"method {name}")
-    if baselines or not chosen:
-        simple = comparison.simpler_methods()
-        chosen |= {name: one for name, one in simple.items() if name not in chosen}
-    if network is not None and isinstance(chosen.get(PHYSICS), Physics):
-        chosen[FUSION] = Fusion(MAIN, PHYSICS)
-    return chosen
+    selection: dict[str, Method] = {} if network is None else {MAIN: network}
+    for name, method in further.items():
+        selection[name] = method if isinstance(method, Model) else PluginMethod(method, f"method {name}")
+    if baselines or not selection:
+        baseline_methods = comparison.simpler_methods()
+        selection |= {name: method for name, method in baseline_methods.items() if name not in selection}
+    if network is not None and isinstance(selection.get(PHYSICS), Physics):
+        selection[FUSION] = Fusion(MAIN, PHYSICS)
+    return selection
 
 
-def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
+def _describe(selection: Mapping[str, Method]) -> dict[str, Any]:
     """Hashes, origins and versions of the networks and plug-ins among the methods, for the report."""
-    networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
-    about = {name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()}
+    networks = {name: method for name, method in selection.items() if isinstance(method, Model)}
+    origins = {name: {"hash": method.identity, "origin": method.origin} for name, method in networks.items()}
     main = networks.get(MAIN)
-    if main is not None and FUSION in chosen:
-        about[FUSION] = {"hash": f"{main.identity} and physics", "origin": main.origin}
-    described: dict[str, Any] = {} if main is None else {"model": main.described()}
-    described["networks"] = about
-    sources = {name: one.source for name, one in chosen.items() if isinstance(one, Plugged) and one.source}
+    if main is not None and FUSION in selection:
+        origins[FUSION] = {"hash": f"{main.identity} and physics", "origin": main.origin}
+    description: dict[str, Any] = {} if main is None else {"model": main.describe()}
+    description["networks"] = origins
+    sources = {
+        name: method.source
+        for name, method in selection.items()
+        if isinstance(method, PluginMethod) and method.source
+    }
     if sources:
-        described["plug_ins"] = sources
-    return described
+        description["plug_ins"] = sources
+    return description
 
 
 def write_result(result: Result, folder: Path, title: str) -> None:

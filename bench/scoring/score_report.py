@@ -40,7 +40,7 @@ def load_template(name: str) -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["shown"] = shown
+    environment.filters["number"] = format_number
     return environment.get_template(name)
 
 
@@ -52,9 +52,9 @@ def render_report(result: Result, title: str = "") -> str:
         figures["components"] = charts.draw_components(result)
     panels, flow_px, force_kpa = pictures(result)
     columns, mae = _columns(result), main.scores.get("mae_mn", math.nan)
-    lower = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
-    in_hindsight = [n for n, m in lower.items() if m.gain and m.gain.source == "hindsight"]
-    better = [n for n in lower if n not in in_hindsight]
+    lower_errors = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
+    in_hindsight = [n for n, m in lower_errors.items() if m.gain and m.gain.source == "hindsight"]
+    better = [n for n in lower_errors if n not in in_hindsight]
     return load_template("report.html.jinja").render(
         title=title or f"Force from video: {result.recording}",
         result=result,
@@ -71,7 +71,7 @@ def render_report(result: Result, title: str = "") -> str:
         depth_mm=_largest_depth(result.tracked),
         panels=panels,
         flow_px=flow_px,
-        masks=None if (masked := picture_masks(result.tracked)) is None else _jpeg(masked),
+        masks=None if (mask_picture := picture_masks(result.tracked)) is None else _jpeg(mask_picture),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
         skill=skill_of(result),
@@ -86,26 +86,28 @@ def terminal_table(result: Result) -> Table:
         table = open_table(title, escape("largest force [mN]"), label="method")
         for name, method in methods.items():
             sizes = method.size_mn[np.isfinite(method.size_mn)]
-            table.add_row(escape(name), shown(float(sizes.max()) if len(sizes) else None))
+            table.add_row(escape(name), format_number(float(sizes.max()) if len(sizes) else None))
         return table
     columns = {key: metric for key, metric in _columns(result).items() if key in _NARROW}
     table = open_table(title, *(escape(metric.column) for metric in columns.values()), label="method")
     for name, method in methods.items():
-        table.add_row(escape(name), *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
+        table.add_row(
+            escape(name), *(format_number(method.scores[key], m.cell_unit) for key, m in columns.items())
+        )
     return table
 
 
 def _columns(result: Result) -> dict[str, Metric]:
     """The columns in which at least one method has a number."""
-    every = [method.scores for method in result.methods.values()]
+    score_tables = [method.scores for method in result.methods.values()]
     return {
         key: metric
         for key, metric in METRICS.items()
-        if metric.column and any(math.isfinite(scores.get(key, math.nan)) for scores in every)
+        if metric.column and any(math.isfinite(scores.get(key, math.nan)) for scores in score_tables)
     }
 
 
-def shown(value: float | None, unit: str = "") -> str:
+def format_number(value: float | None, unit: str = "") -> str:
     """Formats a number: three significant figures, percent and milliseconds converted, a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
@@ -121,35 +123,35 @@ def shown(value: float | None, unit: str = "") -> str:
 def pictures(result: Result) -> tuple[list[dict[str, str | None]], float, float]:
     """The selected frames, with pictures as data URIs, and flow [px of the panel] and density [kPa] at full
     colour."""
-    chosen = select_frames(result)
-    done = result.tracked
-    if not chosen or done.rest is None or done.tissue is None:
+    selection = select_frames(result)
+    tracked = result.tracked
+    if not selection or tracked.rest is None or tracked.tissue is None:
         return [], 0.0, 0.0
-    lengths = [np.linalg.norm(snap.flow, axis=-1)[done.tissue] for _, snap in chosen]
+    lengths = [np.linalg.norm(snapshot.flow, axis=-1)[tracked.tissue] for _, snapshot in selection]
     flow_px = max(float(np.percentile(np.concatenate(lengths), 99.5)), 0.5)
-    maps = [snap.density for _, snap in chosen if snap.density is not None]
-    force_kpa = max([float(np.percentile(m[done.tissue], 99.8)) for m in maps], default=0.0)
-    tissue = done.tissue.astype(np.float32)
-    grey = np.repeat(done.rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    maps = [snapshot.density for _, snapshot in selection if snapshot.density is not None]
+    force_kpa = max([float(np.percentile(m[tracked.tissue], 99.8)) for m in maps], default=0.0)
+    tissue = tracked.tissue.astype(np.float32)
+    grey = np.repeat(tracked.rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
     panels = list[dict[str, str | None]]()
-    for caption, snap in chosen:
-        moved = picture.overlay(grey, picture.flow_colours(snap.flow, flow_px), 0.65 * tissue)
-        moved = picture.arrows(moved, snap.flow, done.tissue, 1.0)
+    for caption, snapshot in selection:
+        flow_picture = picture.overlay(grey, picture.flow_colours(snapshot.flow, flow_px), 0.65 * tissue)
+        flow_picture = picture.arrows(flow_picture, snapshot.flow, tracked.tissue, 1.0)
         force_map = depth = None
-        if snap.density is not None:
-            weight = tissue * np.clip(0.15 + snap.density / max(force_kpa, 1e-12), 0, 0.9)
+        if snapshot.density is not None:
+            weight = tissue * np.clip(0.15 + snapshot.density / max(force_kpa, 1e-12), 0, 0.9)
             dark = (0.6 * grey).astype(np.uint8)
-            force_map = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
-        if snap.depth is not None:
-            depth = _jpeg(_depth_colours(grey, snap.depth, _largest_depth(done), tissue))
-        shown_too = {"flow": _jpeg(moved), "force": force_map, "depth": depth}
-        panels.append({"caption": caption, "frame": _jpeg(snap.rgb), **shown_too})
+            force_map = _jpeg(picture.overlay(dark, picture.heat(snapshot.density, force_kpa), weight))
+        if snapshot.depth is not None:
+            depth = _jpeg(_depth_colours(grey, snapshot.depth, _largest_depth(tracked), tissue))
+        views = {"flow": _jpeg(flow_picture), "force": force_map, "depth": depth}
+        panels.append({"caption": caption, "frame": _jpeg(snapshot.rgb), **views})
     return panels, flow_px, force_kpa
 
 
-def _largest_depth(done: TrackedRecording) -> float:
+def _largest_depth(tracked: TrackedRecording) -> float:
     """Motion in depth [mm] at full colour; 0 without a right or depth camera."""
-    depths = [np.abs(snap.depth) for snap in done.snapshots if snap.depth is not None]
+    depths = [np.abs(snapshot.depth) for snapshot in tracked.snapshots if snapshot.depth is not None]
     return max(float(np.percentile(np.stack(depths), 99.8)), 1e-3) if depths else 0.0
 
 
@@ -162,35 +164,35 @@ def _depth_colours(grey: Pixels, depth: Map, largest: float, tissue: Map) -> Pix
 
 def select_frames(result: Result) -> list[tuple[str, Snapshot]]:
     """The snapshots nearest the largest forces of separate contacts, and those with the largest errors."""
-    snaps = [snap for snap in result.tracked.snapshots if not result.lost[snap.position]]
-    if not snaps:
+    snapshots = [snapshot for snapshot in result.tracked.snapshots if not result.lost[snapshot.position]]
+    if not snapshots:
         return []
-    at = np.array([snap.position for snap in snaps])
-    predicted = result.methods[result.main].size_mn[at]
-    truth = predicted if result.sensor_mn is None else result.sensor_mn[at]
-    height = np.where(np.isfinite(truth), truth, 0.0)
-    taken: list[int] = []
-    apart = max(2, len(snaps) // (2 * _PEAKS))
+    positions = np.array([snapshot.position for snapshot in snapshots])
+    predicted = result.methods[result.main].size_mn[positions]
+    reference = predicted if result.sensor_mn is None else result.sensor_mn[positions]
+    height = np.where(np.isfinite(reference), reference, 0.0)
+    peaks: list[int] = []
+    separation = max(2, len(snapshots) // (2 * _PEAKS))
     for k in np.argsort(-height, kind="stable"):
-        if len(taken) == _PEAKS or height[k] < 0.1 * height.max():
+        if len(peaks) == _PEAKS or height[k] < 0.1 * height.max():
             break
-        if all(abs(int(k) - other) >= apart for other in taken):
-            taken.append(int(k))
-    out = [(_caption(result, snaps[k]), snaps[k]) for k in sorted(taken)]
+        if all(abs(int(k) - other) >= separation for other in peaks):
+            peaks.append(int(k))
+    frames = [(_caption(result, snapshots[k]), snapshots[k]) for k in sorted(peaks)]
     if result.sensor_mn is not None:
-        error = np.nan_to_num(np.abs(predicted - truth), nan=-1.0)
+        error = np.nan_to_num(np.abs(predicted - reference), nan=-1.0)
         for k in np.argsort(-error, kind="stable")[:_WORST]:
-            if int(k) not in taken and error[k] >= 0:
-                out.append(("Large error: " + _caption(result, snaps[k]), snaps[k]))
-    return out
+            if int(k) not in peaks and error[k] >= 0:
+                frames.append(("Large error: " + _caption(result, snapshots[k]), snapshots[k]))
+    return frames
 
 
-def _caption(result: Result, snap: Snapshot) -> str:
-    k = snap.position
-    predicted = shown(result.methods[result.main].size_mn[k])
+def _caption(result: Result, snapshot: Snapshot) -> str:
+    k = snapshot.position
+    predicted = format_number(result.methods[result.main].size_mn[k])
     caption = f"{result.time_s[k]:.2f} s, predicted {predicted} {'mN' if result.absolute else 'mN per kPa'}"
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
-        caption += f", sensor {shown(result.sensor_mn[k])} mN"
+        caption += f", sensor {format_number(result.sensor_mn[k])} mN"
     return caption
 
 
@@ -204,6 +206,6 @@ def _flat(tree: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
 
 
 def _jpeg(rgb: Pixels) -> str:
-    done, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    assert done
+    success, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    assert success
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")

@@ -28,8 +28,10 @@ def report_recordings(recordings: Sequence[Path], out: Path, command: str) -> li
     A recording that can't be scored is a row that says why. Returns the rows; UserError: two of one name.
     """
     names = [folder.resolve().name for folder in recordings]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise UserError(f"two recordings are called {min(twice)}: rename one, each has a folder of its name")
+    if duplicates := {name for name in names if names.count(name) > 1}:
+        raise UserError(
+            f"two recordings are called {min(duplicates)}: rename one, each has a folder of its name"
+        )
     out.mkdir(parents=True, exist_ok=True)
     rows, trees = list[Tree](), list[Tree]()
     for name, folder in zip(names, recordings, strict=True):
@@ -49,7 +51,7 @@ def describe_row(result: Result) -> Tree:
     """A scored recording's row: largest force and its interval [mN], scores over the peak, findings."""
     main = result.methods[result.main]
     row: Tree = {"recording": result.recording, "why": result.refused, "report": True}
-    row["findings"] = [f"{one.cause}: {one.message}" for one in result.findings]
+    row["findings"] = [f"{finding.cause}: {finding.message}" for finding in result.findings]
     if result.refused or not np.isfinite(main.size_mn).any():
         return row
     k = int(np.nanargmax(main.size_mn))

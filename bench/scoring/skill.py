@@ -35,20 +35,20 @@ def skill(time_s: Floats, size_mn: Floats, used: Mask, threshold_mn: float) -> d
 
     Time is that between neighbouring samples which are both used: nothing is bridged.
     """
-    good = used & np.isfinite(size_mn) & np.isfinite(time_s)
-    pair = good[1:] & good[:-1]
-    step_s, change = np.diff(time_s)[pair], np.diff(size_mn)[pair]
-    middle = 0.5 * (size_mn[1:] + size_mn[:-1])[pair]
-    whole_s = float(step_s.sum())
-    if not whole_s > 0:
+    is_valid = used & np.isfinite(size_mn) & np.isfinite(time_s)
+    is_pair = is_valid[1:] & is_valid[:-1]
+    step_s, change = np.diff(time_s)[is_pair], np.diff(size_mn)[is_pair]
+    middle = 0.5 * (size_mn[1:] + size_mn[:-1])[is_pair]
+    total_s = float(step_s.sum())
+    if not total_s > 0:
         return dict.fromkeys(FIGURES, float("nan"))
-    mean = float(step_s @ middle) / whole_s
-    spread = float(np.sqrt(step_s @ (middle - mean) ** 2 / whole_s))
+    mean = float(step_s @ middle) / total_s
+    spread = float(np.sqrt(step_s @ (middle - mean) ** 2 / total_s))
     return {
-        "change_mn_per_s": float(np.abs(change).sum()) / whole_s,
+        "change_mn_per_s": float(np.abs(change).sum()) / total_s,
         "variation": spread / mean if mean > 0 else float("nan"),
         "impulse_mns": float(step_s @ middle),
-        "idle_share": float(step_s[middle < threshold_mn].sum()) / whole_s,
+        "idle_share": float(step_s[middle < threshold_mn].sum()) / total_s,
     }
 
 

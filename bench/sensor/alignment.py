@@ -52,7 +52,7 @@ def align_sensor(
         return AlignedSensor()
     if other := clocks.find_other_unit(time_s, force.time_s):
         return AlignedSensor(notes=(f"{other}: nothing is scored",))
-    offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
+    offset_s, offset = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
     rotation, notes, rate = None, list[str](), recording.meta.sync.rate
     if sensor.turn_s is not None:
         rotation = _find_rotation(force, sensor, offset_s, rate, surface)
@@ -63,18 +63,18 @@ def align_sensor(
             notes = [f"the sensor's rotation was found on {span}: {rotation.describe()}"]
             sensor = sensor.model_copy(update={"to_camera": rotation.rows})
     processed = force_sensor.process_force(force, sensor, offset_s, rate)
-    axes = force_sensor.force_at(processed, time_s)
-    covered = int(np.isfinite(axes).all(axis=1).sum())
-    if 0 < covered < len(time_s):
-        notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
-    refused = list[Finding]()
-    if found is not None and found.refused:
-        scored = f"scored with the stated offset of {offset_s:g} s"
-        why = f"the clocks could not be aligned ({found.refused}): {scored}"
-        refused = [Finding("warning", "clocks", why)]
-    about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
+    axes = force_sensor.interpolate_force(processed, time_s)
+    count = int(np.isfinite(axes).all(axis=1).sum())
+    if 0 < count < len(time_s):
+        notes.append(f"the sensor covers {count} of {len(time_s)} frames; only those are scored")
+    findings = list[Finding]()
+    if offset is not None and offset.refused:
+        fallback = f"scored with the stated offset of {offset_s:g} s"
+        message = f"the clocks could not be aligned ({offset.refused}): {fallback}"
+        findings = [Finding("warning", "clocks", message)]
+    values = processed.noise_floor_mn, processed.steps, offset, rotation, sensor.in_camera_axes, tuple(notes)
     samples = processed.time_s, processed.force_mn
-    return AlignedSensor(axes if covered else None, *about, tuple(refused), samples=samples)
+    return AlignedSensor(axes if count else None, *values, tuple(findings), samples=samples)
 
 
 def judge_drift(sensor: AlignedSensor, meta: SensorMeta, time_s: Floats, moved: Floats) -> AlignedSensor:
@@ -111,8 +111,8 @@ def _find_offset(
     inside = (time_s >= sync.calibration_s[0]) & (time_s <= sync.calibration_s[1])
     smooth = force_sensor.process_force(force, sensor, 0.0, sync.rate)
     samples = smooth.time_s, smooth.force_mn
-    found = clock_sync.find_offset(time_s[inside], speed[inside], *samples, sync.search_s)
-    return sync.offset_s if found.refused else found.offset_s, found
+    offset = clock_sync.find_offset(time_s[inside], speed[inside], *samples, sync.search_s)
+    return sync.offset_s if offset.refused else offset.offset_s, offset
 
 
 def _find_rotation(
@@ -124,5 +124,5 @@ def _find_rotation(
     count = len(surface.time_s)
     moved, visible = (np.stack(parts).astype(np.float64) for parts in (surface.motion, surface.visible))
     processed = force_sensor.process_force(force, sensor, offset_s, rate)
-    at = force_sensor.force_at(processed, np.array(surface.time_s))
-    return find_rotation(moved.reshape(count, -1, 2), visible.reshape(count, -1), at)
+    force_mn = force_sensor.interpolate_force(processed, np.array(surface.time_s))
+    return find_rotation(moved.reshape(count, -1, 2), visible.reshape(count, -1), force_mn)

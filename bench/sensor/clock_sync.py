@@ -44,63 +44,65 @@ def find_offset(
     It is refused if there are too few intervals, the correlation is weak, its peak is at the end of the
     search, or fewer than 95% of block-bootstrap resamples have their peak within a frame of it.
     """
-    good = np.isfinite(force_mn).all(axis=1)
-    t, force = sensor_s[good], force_mn[good]
+    is_valid = np.isfinite(force_mn).all(axis=1)
+    t, force = sensor_s[is_valid], force_mn[is_valid]
     widths = np.diff(frame_s)
-    few = f"frame intervals in the calibration span, {LEAST_INTERVALS} needed"
+    shortage = f"frame intervals in the calibration span, {LEAST_INTERVALS} needed"
     if len(widths) < LEAST_INTERVALS:
-        return Offset(refused=f"only {len(widths)} {few}")
+        return Offset(refused=f"only {len(widths)} {shortage}")
     frame = float(np.median(widths))
     step = frame / _STEPS_PER_FRAME
     offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
     change = np.stack([_change(frame_s - offset, t, force) / widths for offset in offsets])
-    moved = speed[1:]
-    usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
-    if (followed := int(np.isfinite(moved).sum())) < LEAST_INTERVALS:
-        return Offset(refused=f"only {followed} tracked of {len(widths)} {few}")
+    motion = speed[1:]
+    usable = np.isfinite(change).all(axis=0) & np.isfinite(motion)
+    if (tracked_count := int(np.isfinite(motion).sum())) < LEAST_INTERVALS:
+        return Offset(refused=f"only {tracked_count} tracked of {len(widths)} {shortage}")
     if usable.sum() < LEAST_INTERVALS:
-        covered = "doesn't cover the calibration span with the search's margin on both sides"
-        return Offset(refused=f"the sensor {covered}")
-    change, moved = change[:, usable], moved[usable]
-    r = _correlations(np.ones((1, len(moved))), change, moved)[0]
+        gap = "doesn't cover the calibration span with the search's margin on both sides"
+        return Offset(refused=f"the sensor {gap}")
+    change, motion = change[:, usable], motion[usable]
+    r = _correlations(np.ones((1, len(motion))), change, motion)[0]
     if not np.isfinite(r).any():
         return Offset(refused="no motion or no change of force in the calibration span")
     best = int(np.nanargmax(r))
     rng = np.random.default_rng(0)  # reproducible
-    weights = bootstrap.counts(len(moved), bootstrap.block_length(moved), _RESAMPLES, rng)
-    again = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, moved), nan=-1.0), axis=1)]
-    there = np.abs(again - offsets[best]) <= frame
+    weights = bootstrap.counts(len(motion), bootstrap.block_length(motion), _RESAMPLES, rng)
+    peaks_s = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, motion), nan=-1.0), axis=1)]
+    is_same_peak = np.abs(peaks_s - offsets[best]) <= frame
     refused = ""
     if best in (0, len(offsets) - 1):
         refused = f"the correlation still rises at the end of the search, {search_s:g} s"
     elif r[best] < _LEAST_R:
         refused = f"the correlation of force and motion is only {r[best]:.2f}"
-    elif there.mean() < _SAME_PEAK:
-        refused = f"ambiguous: the peak is elsewhere in {100 * (1 - there.mean()):.0f}% of resamples"
-    at_zero, deviation_s = float(r[len(offsets) // 2]), float(again.std())
-    return Offset(_refined(offsets, r, best), float(r[best]), at_zero, deviation_s, refused)
+    elif is_same_peak.mean() < _SAME_PEAK:
+        refused = f"ambiguous: the peak is elsewhere in {100 * (1 - is_same_peak.mean()):.0f}% of resamples"
+    at_zero, deviation_s = float(r[len(offsets) // 2]), float(peaks_s.std())
+    return Offset(_refine_peak(offsets, r, best), float(r[best]), at_zero, deviation_s, refused)
 
 
 def _change(frame_s: Floats, sensor_s: Floats, force_mn: Floats) -> Floats:
     """Magnitude of the change of force over each frame interval [mN]; NaN outside the sensor's record."""
-    at = np.stack([np.interp(frame_s, sensor_s, f, left=np.nan, right=np.nan) for f in force_mn.T], axis=1)
-    return np.asarray(np.linalg.norm(np.diff(at, axis=0), axis=1), np.float64)
+    sampled = np.stack(
+        [np.interp(frame_s, sensor_s, f, left=np.nan, right=np.nan) for f in force_mn.T], axis=1
+    )
+    return np.asarray(np.linalg.norm(np.diff(sampled, axis=0), axis=1), np.float64)
 
 
-def _correlations(weights: Floats, change: Floats, moved: Floats) -> Floats:
+def _correlations(weights: Floats, change: Floats, motion: Floats) -> Floats:
     """Weighted correlations, (B, L), for weights (B, K) and changes (L, K)."""
     n = weights.sum(axis=1, keepdims=True)
-    mean_y = weights @ moved[:, None] / n
+    mean_y = weights @ motion[:, None] / n
     mean_x = weights @ change.T / n
-    cov = weights @ (change * moved).T / n - mean_x * mean_y
+    cov = weights @ (change * motion).T / n - mean_x * mean_y
     var_x = weights @ (change**2).T / n - mean_x**2
-    var_y = weights @ (moved**2)[:, None] / n - mean_y**2
+    var_y = weights @ (motion**2)[:, None] / n - mean_y**2
     with np.errstate(divide="ignore", invalid="ignore"):
         r = cov / np.sqrt(var_x * var_y)
     return np.where((var_x > 1e-12) & (var_y > 1e-18), r, np.nan)
 
 
-def _refined(offsets: NDArray[np.floating], r: Floats, best: int) -> float:
+def _refine_peak(offsets: NDArray[np.floating], r: Floats, best: int) -> float:
     """Maximum of the parabola through the best offset and its neighbours."""
     if best in (0, len(r) - 1):
         return float(offsets[best])

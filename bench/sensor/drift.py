@@ -50,26 +50,26 @@ def find_drift(
     values, middles = [axes[span] for span in spans], [float(t[span].mean()) for span in spans]
     if len(spans) < 2 and samples is not None:
         share, sample_s = _SHORT_SHARE, samples[0]
-        ends = [t[span][[0, -1]] for span in find_rest_spans(t, motion, short=True)]
-        inside = [(sample_s >= a) & (sample_s <= b) & np.isfinite(samples[1]).all(axis=1) for a, b in ends]
-        most = float(np.linalg.norm(axes, axis=1).max(initial=0.0))
+        ends_s = [t[span][[0, -1]] for span in find_rest_spans(t, motion, short=True)]
+        masks = [(sample_s >= a) & (sample_s <= b) & np.isfinite(samples[1]).all(axis=1) for a, b in ends_s]
+        largest_mn = float(np.linalg.norm(axes, axis=1).max(initial=0.0))
         # A force that changes there is a load: the clocks are apart, or the video misses it.
-        inside = [
+        masks = [
             part
-            for part in inside
-            if part.sum() >= _SAMPLES and _change(samples[1][part]) < 0.25 * _SHORT_SHARE * most
+            for part in masks
+            if part.sum() >= _SAMPLES and _change(samples[1][part]) < 0.25 * _SHORT_SHARE * largest_mn
         ]
         values, middles = (
-            [samples[1][part] for part in inside],
-            [float(sample_s[part].mean()) for part in inside],
+            [samples[1][part] for part in masks],
+            [float(sample_s[part].mean()) for part in masks],
         )
     if len(values) < 2:
         return None
     zero = np.stack([np.median(part, axis=0) for part in values])
     variance = [1.57 * float(part.var(axis=0).sum()) / len(part) for part in (values[0], values[-1])]
     change, noise = float(np.linalg.norm(zero[-1] - zero[0])), float(np.sqrt(sum(variance)))
-    most = float(np.linalg.norm(axes - zero[0], axis=1).max())
-    is_clear = change > max(_SIGMAS * noise, share * most)
+    largest_mn = float(np.linalg.norm(axes - zero[0], axis=1).max())
+    is_clear = change > max(_SIGMAS * noise, share * largest_mn)
     return Drift(np.array(middles), zero, change, noise, is_clear)
 
 
@@ -87,11 +87,11 @@ def find_rest_spans(time_s: Floats, moved: Floats, short: bool = False) -> list[
         level, frames, least_s = _SHORT_REST, _SHORT_FRAMES, _SHORT_S
     if len(moved) < 2 * _LEAST_FRAMES:
         return []
-    usual, most = float(np.percentile(moved, _USUAL)), float(moved.max())
-    if not most > _MOVES * usual:
+    usual_motion, largest_motion = float(np.percentile(moved, _USUAL)), float(moved.max())
+    if not largest_motion > _MOVES * usual_motion:
         return []
-    rest = moved < usual + level * (most - usual)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], rest, [False]])))
+    is_rest = moved < usual_motion + level * (largest_motion - usual_motion)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_rest, [False]])))
     spans = list[Mask]()
     for first, stop in zip(edges[::2] + 1, edges[1::2] - 1, strict=True):
         if stop - first >= frames and time_s[stop - 1] - time_s[first] >= least_s:
@@ -105,5 +105,5 @@ def remove_drift(time_s: Floats, axes_mn: Floats, drift: Drift) -> Floats:
     """The sensor (T, 3) mN without the change of its zero since the first span: linear between the spans'
     middles, constant beyond them."""
     change = drift.zero_mn - drift.zero_mn[0]
-    gone = np.stack([np.interp(time_s, drift.time_s, column) for column in change.T], axis=1)
-    return np.asarray(axes_mn - gone, np.float64)
+    drift_mn = np.stack([np.interp(time_s, drift.time_s, column) for column in change.T], axis=1)
+    return np.asarray(axes_mn - drift_mn, np.float64)

@@ -48,25 +48,27 @@ def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRot
     `visible`: (T, P) visible share of each part, in 0..1; `force_mn`: (T, 3) in the sensor's axes, tared;
     frames with NaN are left out. It is refused for few frames, forces in a plane, or a poor fit.
     """
-    good = np.isfinite(force_mn).all(axis=1)
-    if good.sum() < LEAST_TURNING:
-        return SensorRotation(refused=f"only {good.sum()} tracked frames with force, {LEAST_TURNING} needed")
-    force, shift = force_mn[good], _shift(moved[good], visible[good])
+    is_valid = np.isfinite(force_mn).all(axis=1)
+    if is_valid.sum() < LEAST_TURNING:
+        return SensorRotation(
+            refused=f"only {is_valid.sum()} tracked frames with force, {LEAST_TURNING} needed"
+        )
+    force, shift = force_mn[is_valid], _shift(moved[is_valid], visible[is_valid])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
     if not shift.any():
         return SensorRotation(refused="nothing moves")
     if spread[2] < _FLAT * spread[0]:
         return SensorRotation(refused="the force stays in a plane or on a line")
-    every = np.ones(len(force))
-    turn, explained, misfit = _fitted(force, shift, every, _STARTS)
+    equal = np.ones(len(force))
+    turn, explained, misfit = _fit_rotation(force, shift, equal, _STARTS)
     rng = np.random.default_rng(0)  # reproducible
     block = max(bootstrap.block_length(axis) for axis in (*force.T, *shift.T))
-    again = [
-        _fitted(force, shift, weights, Rotation.concatenate([turn]))[0]
+    resamples = [
+        _fit_rotation(force, shift, weights, Rotation.concatenate([turn]))[0]
         for weights in bootstrap.counts(len(force), block, _RESAMPLES, rng)
     ]
-    apart = np.array([(one * turn.inv()).magnitude() for one in again])
-    deviation = float(np.degrees(np.hypot(np.sqrt(np.mean(np.square(apart))), _FREEDOM * misfit)))
+    angles = np.array([(resample * turn.inv()).magnitude() for resample in resamples])
+    deviation = float(np.degrees(np.hypot(np.sqrt(np.mean(np.square(angles))), _FREEDOM * misfit)))
     refused = ""
     if explained < _EXPLAINED:
         refused = f"only {100 * explained:.0f}% of the motion follows the force"
@@ -78,11 +80,13 @@ def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRot
 def _shift(moved: Floats, visible: Floats) -> Floats:
     """Mean motion (T, 2), each part weighted by its mean squared motion over all frames."""
     weight = visible * np.square(moved).sum(axis=2).mean(axis=0)
-    whole = weight.sum(axis=1)
-    return np.asarray((weight[..., None] * moved).sum(axis=1) / np.maximum(whole, 1e-12)[:, None], np.float64)
+    total = weight.sum(axis=1)
+    return np.asarray((weight[..., None] * moved).sum(axis=1) / np.maximum(total, 1e-12)[:, None], np.float64)
 
 
-def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> tuple[Rotation, float, float]:
+def _fit_rotation(
+    force: Floats, shift: Floats, weights: Floats, starts: Rotation
+) -> tuple[Rotation, float, float]:
     """The best rotation over all starts, its share of explained variance, and its misfit relative to the
     unconstrained linear map; motion and force may have an offset."""
     part = weights / weights.sum()
@@ -92,16 +96,16 @@ def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> 
     # The unconstrained linear map from whitened force to motion.
     linear = np.linalg.solve(scale, (force * part[:, None]).T @ shift).T
 
-    def along(turn: Rotation) -> Floats:
+    def project(turn: Rotation) -> Floats:
         return np.asarray(turn.as_matrix()[:2] @ scale, np.float64)
 
-    def left(vector: Floats, start: Rotation) -> Floats:
-        rows = along(Rotation.from_rotvec(vector) * start)
+    def compute_residuals(vector: Floats, start: Rotation) -> Floats:
+        rows = project(Rotation.from_rotvec(vector) * start)
         gain = max(float((linear * rows).sum() / np.square(rows).sum()), 0.0)
         return np.asarray((linear - gain * rows).ravel(), np.float64)
 
-    tried = [(least_squares(left, np.zeros(3), args=(start,)), start) for start in starts]
-    best, start = min(tried, key=lambda one: float(one[0].cost))
+    fits = [(least_squares(compute_residuals, np.zeros(3), args=(start,)), start) for start in starts]
+    best, start = min(fits, key=lambda fit: float(fit[0].cost))
     total = float((part[:, None] * np.square(shift)).sum())
     unexplained = total - float(np.square(linear).sum()) + 2 * float(best.cost)
     misfit = np.sqrt(2 * best.cost / max(float(np.square(linear).sum()), 1e-12))

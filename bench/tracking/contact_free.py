@@ -35,27 +35,27 @@ class ContactFreeSearch:
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
         """Adds a frame at its time [s]; one that is not trusted is in no span."""
-        some = slice(None, None, Limits.step_px), slice(None, None, Limits.step_px)
-        weight = np.sqrt((frame.confidence * self._tissue)[some]).reshape(-1, 1)
-        design, moved = weight * self._smooth, weight * frame.flow[some].reshape(-1, 2)
-        left = moved - design @ np.linalg.lstsq(design.T @ design, design.T @ moved, rcond=None)[0]
+        lattice = slice(None, None, Limits.step_px), slice(None, None, Limits.step_px)
+        weight = np.sqrt((frame.confidence * self._tissue)[lattice]).reshape(-1, 1)
+        design, moved = weight * self._smooth, weight * frame.flow[lattice].reshape(-1, 2)
+        residual = moved - design @ np.linalg.lstsq(design.T @ design, design.T @ moved, rcond=None)[0]
         self._time_s.append(time_s)
-        covered = np.count_nonzero(frame.instruments & self._tissue) / np.count_nonzero(self._tissue)
-        self._covered.append(covered if frame.trusted else np.inf)
-        self._uneven.append(float(np.sqrt(np.square(left).sum() / max(np.square(weight).sum(), 1e-9))))
+        share = np.count_nonzero(frame.instruments & self._tissue) / np.count_nonzero(self._tissue)
+        self._covered.append(share if frame.trusted else np.inf)
+        self._uneven.append(float(np.sqrt(np.square(residual).sum() / max(np.square(weight).sum(), 1e-9))))
 
     def find(self) -> tuple[Span, ...]:
         """First and last time [s] of each; none unless an instrument comes and goes and the tissue moves
         unevenly only where there is one."""
-        covered, uneven, time_s = (np.array(one) for one in (self._covered, self._uneven, self._time_s))
-        free = binary_opening(covered <= Limits.absent, np.ones(Limits.run))
-        shown = np.isfinite(covered) & (covered > Limits.absent)
-        if min(free.sum(), shown.sum()) < Limits.frames:
+        covered, uneven, time_s = (np.array(values) for values in (self._covered, self._uneven, self._time_s))
+        is_free = binary_opening(covered <= Limits.absent, np.ones(Limits.run))
+        is_shown = np.isfinite(covered) & (covered > Limits.absent)
+        if min(is_free.sum(), is_shown.sum()) < Limits.frames:
             return ()
         if np.quantile(covered[np.isfinite(covered)], 0.9) < Limits.present:
             return ()
-        if uneven[free].max() > Limits.still * np.quantile(uneven[shown], 0.9):
+        if uneven[is_free].max() > Limits.still * np.quantile(uneven[is_shown], 0.9):
             return ()
-        ends = np.flatnonzero(np.diff(free, prepend=False, append=False)).reshape(-1, 2)
+        ends = np.flatnonzero(np.diff(is_free, prepend=False, append=False)).reshape(-1, 2)
         spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in ends)
         return spans if sum(b - a for a, b in spans) >= Limits.least_s else ()

@@ -20,8 +20,8 @@ from learn.inference.video_motion import (
     SecondCamera,
     has_right_camera,
     motions,
-    read_only,
     read_options,
+    read_single,
 )
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
@@ -91,19 +91,19 @@ def estimate(
     settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse)
     second = SecondCamera.of(right, calibration, mm_per_unit)
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
-    motion = read_only(source, motions(source, choose_input(source, input), options))
-    known = young_kpa, membrane, membrane_mn_per_mm, living, options.given
-    return apply_physics(motion, *known, young_uncertainty=young_uncertainty)
+    motion = read_single(source, motions(source, choose_input(source, input), options))
+    statements = young_kpa, membrane, membrane_mn_per_mm, living, options.given
+    return apply_physics(motion, *statements, young_uncertainty=young_uncertainty)
 
 
-def choose_input(source: Path | Array, given: str | None) -> str:
+def choose_input(source: Path | Array, requested: str | None) -> str:
     """The displacement to read from stored sequences: the given one, else the recovered one, of two cameras
     where there are."""
-    return given or ("motion" if has_right_camera(source) else "recovered")
+    return requested or ("motion" if has_right_camera(source) else "recovered")
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class PhysicsTrack:
     """What physics was given of T frames, and its estimates."""
 
     index: Ints  # (T,) numbers in the video
@@ -136,28 +136,28 @@ def apply_physics(
         raise UserError(f"young_uncertainty {young_uncertainty}: a relative standard deviation, from 0 to 1")
     if young_uncertainty and young is None:
         raise UserError("young_uncertainty: needs young_kpa and the video's scale")
-    scale, by, stiff = motion.scale_mm_per_px, motion.recovered_by, membrane_mn_per_mm
-    if stiff is not None:
-        low, high = (as_positive("membrane_mn_per_mm", end) for end in stiff)
-        stiff = min(low, high), max(low, high)
-    about: dict[str, Any] = {"living": living, "recovered_by": by, "membrane_mn_per_mm": stiff}
-    scene, physics = MethodContext(motion.tissue, scale, young, membrane, **about), Physics()
-    followed = _follow(motion, scene, physics)
+    scale, recovered_by, stiffness = motion.scale_mm_per_px, motion.recovered_by, membrane_mn_per_mm
+    if stiffness is not None:
+        low, high = (as_positive("membrane_mn_per_mm", end) for end in stiffness)
+        stiffness = min(low, high), max(low, high)
+    extra: dict[str, Any] = {"living": living, "recovered_by": recovered_by, "membrane_mn_per_mm": stiffness}
+    scene, physics = MethodContext(motion.tissue, scale, young, membrane, **extra), Physics()
+    track = _follow(motion, scene, physics)
     findings = problems([*judge_young(young), *motion.findings])
-    trusted = followed.trusted & (not first_fault(findings))
-    ends, warnings = np.full((len(trusted), 2), np.nan), list(physics.warnings)
+    trusted = track.trusted & (not first_fault(findings))
+    bounds_mn, warnings = np.full((len(trusted), 2), np.nan), list(physics.warnings)
     if trusted.any():
-        known = [followed.estimates[k] for k in np.flatnonzero(trusted)]
+        estimates = [track.estimates[k] for k in np.flatnonzero(trusted)]
         stated = float(np.mean([*given, membrane != "unknown", not living]))
-        video = force_interval.gather(known, followed.moved_mm[trusted], followed.cameras, stated)
-        known, reason = force_interval.bound(known, video, young_uncertainty, by)
-        ends[trusted] = [(one.low_mn, one.high_mn) for one in known]
+        video = force_interval.gather(estimates, track.moved_mm[trusted], track.cameras, stated)
+        estimates, reason = force_interval.bound(estimates, video, young_uncertainty, recovered_by)
+        bounds_mn[trusted] = [(force.low_mn, force.high_mn) for force in estimates]
         warnings += [reason] if reason else []
     centre = to_video_px(np.array(physics.view.centre_px), motion)
     out: dict[str, Any] = {
         "density": physics.map_forces()[:, None],
-        "total_force_mn": np.where(trusted, [one.size_mn for one in followed.estimates], np.nan),
-        "force_mn": np.where(trusted[:, None], [one.force_mn for one in followed.estimates], np.nan),
+        "total_force_mn": np.where(trusted, [force.size_mn for force in track.estimates], np.nan),
+        "force_mn": np.where(trusted[:, None], [force.force_mn for force in track.estimates], np.nan),
         "trusted": trusted,
         "mask": physics.view.mask,
         "pitch_mm": GRID.pitch_mm,
@@ -166,28 +166,28 @@ def apply_physics(
         "centres_px": np.tile(centre, (len(trusted), 1)),
         "young_kpa": UNKNOWN_YOUNG_KPA if young is None else young,
         "young_known": young is not None,
-        "frame": followed.index,
+        "frame": track.index,
     }
-    if np.isfinite(followed.time_s).any():
-        out["time_s"] = followed.time_s
-    if np.isfinite(ends).any():
-        out |= {"low_mn": ends[:, 0], "high_mn": ends[:, 1], "level": np.array([LEVEL])}
+    if np.isfinite(track.time_s).any():
+        out["time_s"] = track.time_s
+    if np.isfinite(bounds_mn).any():
+        out |= {"low_mn": bounds_mn[:, 0], "high_mn": bounds_mn[:, 1], "level": np.array([LEVEL])}
     notes = gather_notes((), findings, [*motion.notes, *physics.notes, *warnings], trusted)
     return out | {"notes": notes}
 
 
-def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> Followed:
+def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> PhysicsTrack:
     """Applies physics to every frame, and again to all once spans without contact are known."""
-    free, cameras = ContactFreeSearch(motion.tissue, scene.scale_mm_per_px), 1
+    search, cameras = ContactFreeSearch(motion.tissue, scene.scale_mm_per_px), 1
     rows = list[tuple[int, float, bool, float]]()
     for frame in motion.frames():
         physics(frame, scene, False)
-        free.add(frame, frame.time_s or 0.0)
+        search.add(frame, frame.time_s or 0.0)
         time_s = math.nan if frame.time_s is None else frame.time_s
         rows.append((frame.index, time_s, frame.trusted, force_interval.find_motion(frame.flow, scene)))
         cameras = 1 if frame.motion is None else 2
     index, times, trusted, moved_mm = map(np.array, zip(*rows, strict=True))
     # False without spans.
-    inside = np.any([(times >= start) & (times <= end) for start, end in free.find()], axis=0)
+    inside = np.any([(times >= start) & (times <= end) for start, end in search.find()], axis=0)
     estimates = physics.revise(np.asarray(trusted & inside))
-    return Followed(index, times, trusted, moved_mm, cameras, estimates)
+    return PhysicsTrack(index, times, trusted, moved_mm, cameras, estimates)

@@ -86,25 +86,25 @@ def stream_video(
     scene = MethodContext(video.rest.tissue, mm_per_px, young, recovered_by=name_motion(settings.backend))
     stops = () if camera is None else (KeyboardInterrupt,)
     with suppress(*stops):
-        for found in video.frames():
-            if found.is_rest:
+        for motion in video.frames():
+            if motion.is_rest:
                 continue
-            began, force = time.perf_counter(), None
-            if method is not None and found.trusted:
-                force = method(found, scene, False).size_mn
-            end, visible = time.perf_counter(), found.confidence > 0
+            start_s, force = time.perf_counter(), None
+            if method is not None and motion.trusted:
+                force = method(motion, scene, False).size_mn
+            end_s, visible = time.perf_counter(), motion.confidence > 0
             frame = LiveFrame(
-                index=found.index,
-                latency_s=end - pace.arrivals_s.pop(found.index),
-                stages_s={"mask": found.masking_s, "flow": found.wall_s, "force": end - began},
-                confidence=float(found.confidence[visible].mean()) if visible.any() else 0.0,
-                trusted=found.trusted,
-                largest_px=float(np.hypot(*found.flow[visible].T).max()) if visible.any() else 0.0,
+                index=motion.index,
+                latency_s=end_s - pace.arrivals_s.pop(motion.index),
+                stages_s={"mask": motion.masking_s, "flow": motion.wall_s, "force": end_s - start_s},
+                confidence=float(motion.confidence[visible].mean()) if visible.any() else 0.0,
+                trusted=motion.trusted,
+                largest_px=float(np.hypot(*motion.flow[visible].T).max()) if visible.any() else 0.0,
                 force_mn=force,
             )
             stream.frames.append(frame)
             report(frame)
-            if camera is not None and (found.time_s or 0.0) - (video.rest.time_s or 0.0) >= seconds:
+            if camera is not None and (motion.time_s or 0.0) - (video.rest.time_s or 0.0) >= seconds:
                 break
     stream.dropped, stream.findings = pace.dropped, problems(video.findings)
     if not stream.frames:

@@ -95,13 +95,13 @@ def track_recording(
     flow: LocalFlow | None = None,
     progress: Progress = lambda done: None,
     only: Container[int] | None = None,
-    each: Callable[[FrameMotion], None] = lambda frame: None,
+    on_frame: Callable[[FrameMotion], None] = lambda frame: None,
 ) -> TrackedRecording:
     """Tracks the video and applies every method, with a few frames in memory.
 
     `scale_mm_per_px`: of the original pixels. `pictured`: the method whose force map the snapshots show.
     `flow`: computes the flow, in another process while the methods are applied to the previous frame, and is
-    closed by the caller; None: in this process. `progress`: called after every frame; `each`: with every
+    closed by the caller; None: in this process. `progress`: called after every frame; `on_frame`: with every
     tracked frame. `only`: numbers of the frames to track, with the rest frame; None: all. UserError for an
     unreadable video, no frame with a time, a rest frame beyond the end, and masks of another size.
     """
@@ -113,31 +113,31 @@ def track_recording(
     ) as track:
         video = track.video
         mm_per_px = scale_mm_per_px * video.rest.shrink
-        known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
+        tissue = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
         backend = name_motion(settings.backend)
-        stiff = about.membrane_mn_per_mm
-        scene = MethodContext(video.rest.tissue, mm_per_px, *known, backend, about.alpha, stiff)
+        stiffness = about.membrane_mn_per_mm
+        scene = MethodContext(video.rest.tissue, mm_per_px, *tissue, backend, about.alpha, stiffness)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         turning = SurfaceMotion(video.rest.tissue)
-        free = ContactFreeSearch(video.rest.tissue, mm_per_px)
+        search = ContactFreeSearch(video.rest.tissue, mm_per_px)
         for frame in track.frames():
-            each(frame)
+            on_frame(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
-                free.add(frame, frame.time_s)
+                search.add(frame, frame.time_s)
                 if (span := about.sensor.turn_s) and frame.trusted and span[0] <= frame.time_s <= span[1]:
                     turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    found_s = free.find()
-    forces.finish(recording, found_s)
+    absent_s = search.find()
+    forces.finish(recording, absent_s)
     out = forces.out
     out.stereo = None if track.pair is None else track.pair.quality
     out.turning = turning if turning.time_s else None
     out.scale_mm_per_px = scale_mm_per_px
     _describe(out, track, recording, methods, pictured)
-    if found_s:
-        spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in found_s)
+    if absent_s:
+        spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in absent_s)
         out.notes.append(f"no contact is assumed in {spans} s, where no instrument is over the tissue")
     out.timings |= watch.report()
     return out
@@ -173,11 +173,11 @@ def _describe(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
         out.notes.append(out.stereo.describe())
-    if (removed := track.removed) is not None:
-        out.notes.append(removed.describe(mm_per_px))
+    if (pulse := track.removed) is not None:
+        out.notes.append(pulse.describe(mm_per_px))
         out.pulse = [
             {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
-            for rhythm, size in zip(removed.rhythms, removed.amplitudes_px, strict=True)
+            for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
         ]
 
 
@@ -194,8 +194,8 @@ class _Forces:
     ) -> None:
         """Starts with the rest frame and the constants of the recording."""
         self.methods, self.pictured, self.watch, self.scene = methods, pictured, watch, scene
-        self.out = TrackedRecording(pictured=pictured, rest=_shrunk(rest.rgb))
-        self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
+        self.out = TrackedRecording(pictured=pictured, rest=_shrink(rest.rgb))
+        self.out.tissue = _shrink(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: Map | None = None
         self.motion_mm: list[float] = []  # mean length of the flow over the tissue
@@ -205,15 +205,15 @@ class _Forces:
         """Adds the forces of a frame at its time [s]."""
         out, scene, inside = self.out, self.scene, self.scene.tissue
         position = len(out.time_s)
-        wanted = position % self.stride == 0
+        is_snapshot = position % self.stride == 0
         self.cameras = 1 if frame.motion is None else 2
         estimates: dict[str, ForceEstimate] = {}
         for name, method in self.methods.items():
             if not isinstance(method, Fusion):
                 with self.watch.stage(name):
-                    estimates[name] = method(frame, scene, wanted and name == self.pictured)
+                    estimates[name] = method(frame, scene, is_snapshot and name == self.pictured)
         density = estimates[self.pictured].density if self.pictured in estimates else None
-        self.estimates.append({name: replace(one, density=None) for name, one in estimates.items()})
+        self.estimates.append({name: replace(estimate, density=None) for name, estimate in estimates.items()})
         speed = 0.0
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
@@ -225,32 +225,34 @@ class _Forces:
         self.last = frame.flow
         out.frame.append(frame.index)
         out.time_s.append(time_s)
-        if wanted:
+        if is_snapshot:
             self._snap(position, frame, density)
 
-    def finish(self, recording: Recording, found_s: Sequence[Span]) -> None:
-        """Computes results that need all frames; `found_s`: contact-free spans besides those stated [s]."""
+    def finish(self, recording: Recording, absent_s: Sequence[Span]) -> None:
+        """Computes results that need all frames; `absent_s`: contact-free spans besides those stated [s]."""
         about = recording.meta
         rate, offset_s = about.sync.rate, about.sync.offset_s
         sensor_s = [(rate * a + offset_s, rate * b + offset_s) for a, b in about.sensor.free_s]
         stated = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times, trusted = np.array(self.out.time_s), np.array(self.out.trusted, bool)
 
-        def within(spans: Sequence[Span]) -> Mask:
+        def mask_spans(spans: Sequence[Span]) -> Mask:
             inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
             return np.asarray(trusted & inside)
 
-        contact_free = within([*stated, *found_s])
+        contact_free = mask_spans([*stated, *absent_s])
         for name, method in self.methods.items():
             if isinstance(method, Revising):
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate
         tracked = [self.estimates[k] for k in np.flatnonzero(trusted)]
-        known_mn = np.where(within(stated), 0.0, np.nan)
+        known_mn = np.where(mask_spans(stated), 0.0, np.nan)
         if about.press_s is not None and about.young_kpa is not None:
-            pressed = align_sensor(recording, times, np.where(trusted, self.out.speed, np.nan), None).size_mn
-            known_mn = known_mn if pressed is None else np.where(within([about.press_s]), pressed, known_mn)
+            press_mn = align_sensor(recording, times, np.where(trusted, self.out.speed, np.nan), None).size_mn
+            known_mn = (
+                known_mn if press_mn is None else np.where(mask_spans([about.press_s]), press_mn, known_mn)
+            )
         for name, method in self.methods.items():
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
@@ -281,11 +283,11 @@ class _Forces:
 
     def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""
-        small = None if density is None else _shrunk(density)
-        flow = _shrunk(frame.flow) * np.float32(_ratio(frame.rgb.shape[1]))
-        moved = frame.motion
-        depth = None if moved is None else _shrunk(np.ascontiguousarray(moved.motion[..., 2]))
-        self.out.snapshots.append(Snapshot(position, _shrunk(frame.rgb), flow, small, depth))
+        density_map = None if density is None else _shrink(density)
+        flow = _shrink(frame.flow) * np.float32(_ratio(frame.rgb.shape[1]))
+        motion = frame.motion
+        depth = None if motion is None else _shrink(np.ascontiguousarray(motion.motion[..., 2]))
+        self.out.snapshots.append(Snapshot(position, _shrink(frame.rgb), flow, density_map, depth))
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2
@@ -301,7 +303,7 @@ def _ratio(width: int) -> float:
     return min(1.0, _SNAPSHOT_WIDTH / width)
 
 
-def _shrunk(array: NDArray[A]) -> NDArray[A]:
+def _shrink(array: NDArray[A]) -> NDArray[A]:
     """Downsamples an array (H, W[, C]) to the width of a snapshot."""
     ratio = _ratio(array.shape[1])
     if ratio == 1.0:
@@ -317,12 +319,12 @@ def picture_masks(tracked: TrackedRecording) -> Pixels | None:
         return None
     if summary.rest_masked is None and not summary.masked_count.any() and tissue.all():
         return None
-    often = _shrunk(summary.masked_count / max(summary.frames, 1))[..., None]
-    shown = rest * (1 - 0.7 * often) + 0.7 * often * np.array([230, 40, 30])
+    masked_share = _shrink(summary.masked_count / max(summary.frames, 1))[..., None]
+    tinted = rest * (1 - 0.7 * masked_share) + 0.7 * masked_share * np.array([230, 40, 30])
     if summary.rest_masked is not None:
-        always = _shrunk(summary.rest_masked.astype(np.float32))[..., None]
-        shown = shown * (1 - 0.5 * always) + 0.5 * always * np.array([240, 200, 30])
-    picture = np.asarray(np.clip(shown, 0, 255), np.uint8)
+        rest_mask = _shrink(summary.rest_masked.astype(np.float32))[..., None]
+        tinted = tinted * (1 - 0.5 * rest_mask) + 0.5 * rest_mask * np.array([240, 200, 30])
+    picture = np.asarray(np.clip(tinted, 0, 255), np.uint8)
     inside = (tissue & ~tissue.all()).astype(np.uint8)  # tissue that fills the picture has no outline
     edges = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     return np.asarray(cv2.drawContours(picture, edges, -1, (60, 230, 90), 1), np.uint8)

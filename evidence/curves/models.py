@@ -34,9 +34,9 @@ def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
     size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
     x, force = x / size[group, None], force / size[group, None]
     # Across the line of sight force is far more visible in flow than along it. No motion is no force.
-    how: dict[str, Any] = {"fit_intercept": False, "scoring": "neg_mean_squared_error"}
-    how |= {"alphas": _STRENGTHS * np.square(x).sum() / x.shape[1], "cv": PredefinedSplit(group % _FOLDS)}
-    across, along = (RidgeCV(**how).fit(x, force[:, part]) for part in (slice(0, 2), 2))
+    options: dict[str, Any] = {"fit_intercept": False, "scoring": "neg_mean_squared_error"}
+    options |= {"alphas": _STRENGTHS * np.square(x).sum() / x.shape[1], "cv": PredefinedSplit(group % _FOLDS)}
+    across, along = (RidgeCV(**options).fit(x, force[:, part]) for part in (slice(0, 2), 2))
     return SimpleNamespace(predict=lambda rows: np.column_stack([across.predict(rows), along.predict(rows)]))
 
 
@@ -46,7 +46,7 @@ def fit_ridge_on_components(fit: Sequence[Clip], source: str) -> Callable[[Clip,
     Returns:
         From a clip and the name of its displacement to its total force (T, 3) mN, camera axes.
     """
-    small = [coarser(clip) for clip in fit]
+    small = [coarsen(clip) for clip in fit]
     # Not centred, so that zero motion stays zero.
     x, _, _ = samples(small[:_BASIS], source)
     basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
@@ -60,26 +60,26 @@ def fit_ridge_on_components(fit: Sequence[Clip], source: str) -> Callable[[Clip,
     regressor = fit_ridge(x, force, group)
 
     def estimate(clip: Clip, displacement: str) -> Floats:
-        found = regressor.predict(basis.transform(rows(coarser(clip), displacement)))
-        return clip.young_kpa * np.asarray(found)
+        force = regressor.predict(basis.transform(rows(coarsen(clip), displacement)))
+        return clip.young_kpa * np.asarray(force)
 
     return estimate
 
 
-def turned(clip: Clip) -> list[Clip]:
+def rotate_clip(clip: Clip) -> list[Clip]:
     """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
 
-    def each(fields: Array, turn: int) -> Array:
+    def rotate(fields: Array, turn: int) -> Array:
         return rotate_tensors(torch.from_numpy(np.array(fields)), turn).numpy()
 
     return [
         replace(
             clip,
-            displacement={name: each(moved, turn) for name, moved in clip.displacement.items()},
-            mask=each(clip.mask[None, None], turn)[0, 0],
-            confidence=each(clip.confidence[:, None], turn)[:, 0],
-            density=each(clip.density, turn),
-            force=each(clip.force[..., None, None], turn)[..., 0, 0],
+            displacement={name: rotate(motion, turn) for name, motion in clip.displacement.items()},
+            mask=rotate(clip.mask[None, None], turn)[0, 0],
+            confidence=rotate(clip.confidence[:, None], turn)[:, 0],
+            density=rotate(clip.density, turn),
+            force=rotate(clip.force[..., None, None], turn)[..., 0, 0],
         )
         for turn in range(8)
     ]
@@ -92,14 +92,14 @@ def rows(clip: Clip, source: str = "recovered") -> Floats:
 
 def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Frames in all orientations: displacement, force over E (n, 3), and the index of their sequence (n,)."""
-    clips = [turned(clip) for clip in fit]
+    clips = [rotate_clip(clip) for clip in fit]
     x = np.concatenate([rows(t, source) for turns in clips for t in turns])
     force = np.concatenate([t.force / t.young_kpa for turns in clips for t in turns])
     group = np.repeat(np.arange(len(fit)), [sum(t.frames for t in turns) for turns in clips])
     return x, force, group
 
 
-def coarser(clip: Clip, times: int = 2) -> Clip:
+def coarsen(clip: Clip, times: int = 2) -> Clip:
     """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
 
     def blocks(values: Map) -> Map:
@@ -116,7 +116,7 @@ def coarser(clip: Clip, times: int = 2) -> Clip:
     return replace(
         clip,
         mask=mask,
-        displacement={name: mean(np.asarray(moved)) for name, moved in clip.displacement.items()},
+        displacement={name: mean(np.asarray(motion)) for name, motion in clip.displacement.items()},
         confidence=mean(np.asarray(clip.confidence)),
         density=np.stack([settle(d, mask) for d in blocks(np.asarray(clip.density))]),
     )
@@ -124,9 +124,9 @@ def coarser(clip: Clip, times: int = 2) -> Clip:
 
 def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bool = False) -> Floats:
     """Total force (T, 3) mN estimated by a network with vector output."""
-    moved = np.asarray(clip.displacement[source])
+    displacement = np.asarray(clip.displacement[source])
     membrane = clip.membrane if membrane_known else "unknown"
-    density = predictor.density(moved, clip.mask, clip.young_kpa, clip.confidence_of(source), membrane)
+    density = predictor.density(displacement, clip.mask, clip.young_kpa, clip.confidence_of(source), membrane)
     return total_force(density, predictor.grid)
 
 
@@ -136,10 +136,10 @@ def errors(predicted: Sequence[Floats], true: Sequence[Floats]) -> dict[str, lis
     Returns:
         `errors` of the whole vector, and its parts `across` and `along` the line of sight.
     """
-    found: dict[str, list[float]] = {"errors": [], "across": [], "along": []}
+    columns: dict[str, list[float]] = {"errors": [], "across": [], "along": []}
     for estimate, force in zip(predicted, true, strict=True):
-        own = np.square(force).sum(axis=1).mean()
-        off = np.square(estimate - force).mean(axis=0) / own
-        for name, parts in (("errors", off), ("across", off[:2]), ("along", off[2:])):
-            found[name].append(float(np.sqrt(parts.sum())))
-    return found
+        mean_square = np.square(force).sum(axis=1).mean()
+        relative = np.square(estimate - force).mean(axis=0) / mean_square
+        for name, parts in (("errors", relative), ("across", relative[:2]), ("along", relative[2:])):
+            columns[name].append(float(np.sqrt(parts.sum())))
+    return columns

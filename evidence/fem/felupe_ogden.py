@@ -30,7 +30,7 @@ from felupe.constitution.tensortrax.models.hyperelastic import ogden
 
 FIRM = 40.0  # k0 over E/a
 PENALTY = 200.0  # kPa/mm, for E = 1 kPa
-SCENES = [  # Poisson's ratio, alpha, radius of the disc and way of the instrument in mm
+SCENES = [  # Poisson's ratio, alpha, radius of the disc and travel of the instrument in mm
     (0.45, -5.0, 5.0, [0.0, 0.0, -3.0]),
     (0.45, -5.0, 5.0, [3.0, 0.0, 0.0]),
     (0.45, -15.0, 5.0, [0.0, 0.0, -4.0]),
@@ -64,8 +64,8 @@ def points():
     for poisson, alpha in ((0.45, -4.7), (0.4, -15.0), (0.49, 3.0)):
         f = np.eye(3) + 0.25 * rng.uniform(-1, 1, (6, 3, 3))
         law = Hyperelastic(energy, mu=lame(poisson)[0], lam=lame(poisson)[1], alpha=alpha)
-        turned = np.ascontiguousarray(np.moveaxis(f, 0, -1))[..., None]
-        stress, tangent = law.gradient([turned, None])[0], law.hessian([turned, None])[0]
+        gradients = np.ascontiguousarray(np.moveaxis(f, 0, -1))[..., None]
+        stress, tangent = law.gradient([gradients, None])[0], law.hessian([gradients, None])[0]
         rows.append(
             {
                 "poisson": poisson,
@@ -81,8 +81,8 @@ def points():
 class Layer:
     """Springs between the top and an instrument."""
 
-    def __init__(self, field, mesh, radius, way, middle):
-        self.field, self.way, self.part = field, np.array(way), 0.0
+    def __init__(self, field, mesh, radius, travel, middle):
+        self.field, self.travel, self.fraction = field, np.array(travel), 0.0
         top = mesh.points[:, 2] > -1e-9
         region = fem.RegionQuadraticHexahedronBoundary(mesh, only_surface=True, mask=top)
         cells, size = region.mesh.cells, len(mesh.points)
@@ -99,7 +99,7 @@ class Layer:
 
     def force(self):
         u = self.field[0].values.ravel()
-        return np.kron(self.load, self.part * self.way) - self.springs @ u
+        return np.kron(self.load, self.fraction * self.travel) - self.springs @ u
 
     def stiffness(self):
         return self.springs
@@ -109,7 +109,7 @@ class Ball:
     """A rigid ball without friction that touches the top at rest, and is pressed in by a penalty."""
 
     def __init__(self, field, mesh, radius, depth):
-        self.field, self.radius, self.depth, self.part, self.touched = field, radius, depth, 0.0, 0.0
+        self.field, self.radius, self.depth, self.fraction, self.touched = field, radius, depth, 0.0, 0.0
         top = mesh.points[:, 2] > -1e-9
         region = fem.RegionQuadraticHexahedronBoundary(mesh, only_surface=True, mask=top)
         self.cells, self.points, self.area = region.mesh.cells, mesh.points, region.dV
@@ -118,11 +118,11 @@ class Ball:
     def overlap(self):
         """Overlap (q, c) mm at quadrature points, and unit vectors (q, c, 3) out of the ball."""
         place = np.einsum("cai,aqc->qci", (self.points + self.field[0].values)[self.cells], self.h)
-        away = place - [0, 0, self.radius - self.part * self.depth]
-        far = np.linalg.norm(away, axis=-1)
-        overlap = np.maximum(self.radius - far, 0)
+        offset = place - [0, 0, self.radius - self.fraction * self.depth]
+        distance = np.linalg.norm(offset, axis=-1)
+        overlap = np.maximum(self.radius - distance, 0)
         self.touched = np.hypot(place[..., 0], place[..., 1])[overlap > 0].max(initial=0.0)
-        return overlap, away / far[..., None]
+        return overlap, offset / distance[..., None]
 
     def force(self):
         overlap, normal = self.overlap()
@@ -142,13 +142,13 @@ class Ball:
         return sp.csr_matrix((local.ravel(), (rows, columns)), shape=(self.points.size,) * 2)
 
 
-def graded(end, count, first):
+def grade_steps(end, count, first):
     """Coordinates (count + 1,) from 0 to `end` in growing steps, the first about `first`."""
     steps = np.geomspace(first, first * 8, count)
     return np.append(0, np.cumsum(steps) * end / steps.sum())
 
 
-def spaced(end, size):
+def space_steps(end, size):
     """Coordinates from 0 to `end` whose steps follow `size(x)`, and are no longer."""
     x = np.linspace(0, end, 4001)
     count = np.append(0, np.cumsum(np.diff(x) / size(0.5 * (x[1:] + x[:-1]))))
@@ -162,41 +162,41 @@ def edge_lines(radius, half, depth, fine):
     def side(x):
         return first * (1 + 3 * np.maximum(x / radius - 1.15, 0) + 1.5 * np.maximum(0.55 - x / radius, 0))
 
-    return spaced(half, side), -spaced(depth, lambda z: first * (1 + 2.5 * z / radius))[::-1]
+    return space_steps(half, side), -space_steps(depth, lambda z: first * (1 + 2.5 * z / radius))[::-1]
 
 
 def opening_lines(half, depth, fine):
     """Lines along x and y, and along z; `fine`: elements from middle to side."""
-    return graded(half, fine, 1.0), -graded(depth, fine - 1, 1.2)[::-1]
+    return grade_steps(half, fine, 1.0), -grade_steps(depth, fine - 1, 1.2)[::-1]
 
 
-def solve(poisson, alpha, press, way_mm, half, depth, opening, lines):
+def solve(poisson, alpha, make_contact, travel_mm, half, depth, opening, lines):
     """Nodes (N, 3), displacement (N, 3) mm, reaction (3,) mN and what presses; `lines`: of the grid, above;
-    `press`: made of field and mesh."""
+    `make_contact`: from field and mesh."""
     side, z = lines
     x, y = np.append(-side[:0:-1], side), side
     mesh = fem.mesh.add_midpoints_edges(fem.mesh.Grid(x, y, np.unique(z)))
     region = fem.RegionQuadraticHexahedron(mesh)
     field = fem.FieldContainer([fem.Field(region, dim=3)])
     p = mesh.points
-    held = (
+    fixed = (
         (np.abs(np.abs(p[:, 0]) - half) < 1e-9) | (np.abs(p[:, 1] - half) < 1e-9) | (p[:, 2] < 1e-9 - depth)
     )
-    held |= (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) > opening)
+    fixed |= (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) > opening)
     bounds = {
-        "held": fem.Boundary(field[0], mask=held),
+        "held": fem.Boundary(field[0], mask=fixed),
         "middle": fem.Boundary(field[0], mask=np.abs(p[:, 1]) < 1e-9, skip=(1, 0, 1)),
     }
     mu, lam = lame(poisson)
     body = fem.SolidBody(Hyperelastic(energy, mu=mu, lam=lam, alpha=alpha), field)
-    layer = press(field, mesh)
+    contact = make_contact(field, mesh)
     dof0, dof1 = fem.dof.partition(field, bounds)
-    steps = int(np.ceil(way_mm))
+    steps = int(np.ceil(travel_mm))
     for k in range(steps):
-        layer.part = (k + 1) / steps
+        contact.fraction = (k + 1) / steps
         for _ in range(30):
-            force = body.assemble.vector(field) - sp.csr_matrix(layer.force()[:, None])
-            stiff = body.assemble.matrix(field) + layer.stiffness()
+            force = body.assemble.vector(field) - sp.csr_matrix(contact.force()[:, None])
+            stiff = body.assemble.matrix(field) + contact.stiffness()
             system = fem.solve.partition(field, stiff, dof1, dof0, force)
             du = fem.solve.solve(*system, solver=pypardiso.spsolve)
             field += du
@@ -205,59 +205,59 @@ def solve(poisson, alpha, press, way_mm, half, depth, opening, lines):
                 break
         else:
             raise SystemExit("no convergence")
-    reaction = 2 * layer.force().reshape(-1, 3).sum(axis=0) * [1, 0, 1]  # by symmetry
-    print(region.mesh.ncells, poisson, alpha, way_mm, reaction, flush=True)
-    return p, field[0].values, reaction, layer
+    reaction = 2 * contact.force().reshape(-1, 3).sum(axis=0) * [1, 0, 1]  # by symmetry
+    print(region.mesh.ncells, poisson, alpha, travel_mm, reaction, flush=True)
+    return p, field[0].values, reaction, contact
 
 
-def drive(poisson, alpha, radius, way, middle, *block):
+def drive(poisson, alpha, radius, travel, middle, *block):
     """As `solve`, without what presses, of a disc that is driven."""
-    press = partial(Layer, radius=radius, way=way, middle=middle)
-    return solve(poisson, alpha, press, np.linalg.norm(way), *block)[:3]
+    make_contact = partial(Layer, radius=radius, travel=travel, middle=middle)
+    return solve(poisson, alpha, make_contact, np.linalg.norm(travel), *block)[:3]
 
 
 def ball(poisson, alpha, radius, depth):
-    press = partial(Ball, radius=radius, depth=depth)
+    make_contact = partial(Ball, radius=radius, depth=depth)
     lines = edge_lines(np.sqrt(radius * depth), 20.0, 20.0, 5)
-    p, u, reaction, layer = solve(poisson, alpha, press, 2 * depth, 20.0, 20.0, np.inf, lines)
-    seen = (p[:, 2] > -1e-9) & (np.abs(p[:, 1]) < 1e-9) & (p[:, 0] > -1e-9) & (p[:, 0] < 12)
+    p, u, reaction, contact = solve(poisson, alpha, make_contact, 2 * depth, 20.0, 20.0, np.inf, lines)
+    line_nodes = (p[:, 2] > -1e-9) & (np.abs(p[:, 1]) < 1e-9) & (p[:, 0] > -1e-9) & (p[:, 0] < 12)
     return {
         "poisson": poisson,
         "alpha": alpha,
         "radius": radius,
         "depth": depth,
-        "touched": round(float(layer.touched), 3),
+        "touched": round(float(contact.touched), 3),
         "reaction": reaction.round(4).tolist(),
-        "places": p[seen, 0].round(4).tolist(),  # along x
-        "displacement": u[seen].round(5).tolist(),
+        "places": p[line_nodes, 0].round(4).tolist(),  # along x
+        "displacement": u[line_nodes].round(5).tolist(),
     }
 
 
-def scene(poisson, alpha, radius, way, fine):
+def scene(poisson, alpha, radius, travel, fine):
     lines = edge_lines(radius, 20.0, 20.0, fine)
-    p, u, reaction = drive(poisson, alpha, radius, way, 0.0, 20.0, 20.0, np.inf, lines)
-    near = [int(np.abs(p - [x, y, 0]).sum(axis=1).argmin()) for x, y in PLACES]
+    p, u, reaction = drive(poisson, alpha, radius, travel, 0.0, 20.0, 20.0, np.inf, lines)
+    nodes = [int(np.abs(p - [x, y, 0]).sum(axis=1).argmin()) for x, y in PLACES]
     return {
         "poisson": poisson,
         "alpha": alpha,
         "radius": radius,
-        "way": way,
+        "way": travel,
         "reaction": reaction.round(4).tolist(),
-        "places": p[near].round(4).tolist(),
-        "displacement": u[near].round(5).tolist(),
+        "places": p[nodes].round(4).tolist(),
+        "displacement": u[nodes].round(5).tolist(),
     }
 
 
-def opening(poisson, alpha, radius, way, middle, fine):
+def opening(poisson, alpha, radius, travel, middle, fine):
     lines = opening_lines(30.0, 40.0, fine)
-    p, u, reaction = drive(poisson, alpha, radius, way, middle, 30.0, 40.0, OPENING, lines)
-    seen = (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) < OPENING + 4)
+    p, u, reaction = drive(poisson, alpha, radius, travel, middle, 30.0, 40.0, OPENING, lines)
+    top_nodes = (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) < OPENING + 4)
     return {
         "poisson": poisson,
         "alpha": alpha,
         "reaction": reaction.tolist(),
-        "places": p[seen, :2].round(4).tolist(),  # of the half with y >= 0
-        "displacement": u[seen].round(5).tolist(),
+        "places": p[top_nodes, :2].round(4).tolist(),  # of the half with y >= 0
+        "displacement": u[top_nodes].round(5).tolist(),
     }
 
 

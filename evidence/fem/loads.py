@@ -42,9 +42,9 @@ def measure_sequence(job: synth.Job, index: int) -> Row:
     }
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """A row for each job: least, median and greatest over its sequences."""
-    by_job = {name: rows for (name,), rows in report.grouped(found["rows"], "job").items()}
+    by_job = {name: rows for (name,), rows in report.group_rows(data["rows"], "job").items()}
     solved = {name: [row for row in rows if "refused" not in row] for name, rows in by_job.items()}
     table = [
         {"job": name, "sequences": len(rows)}
@@ -62,7 +62,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
     words = ("Median [least, greatest] of each job's first sequences, by their mechanics alone.",)
     return report.Page(
-        "Force and motion of each job", found, words, [report.Section("Jobs", table)], report.chart(draw)
+        "Force and motion of each job", data, words, [report.Section("Jobs", table)], report.chart(draw)
     )
 
 

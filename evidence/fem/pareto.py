@@ -40,34 +40,44 @@ def measure(load: float = 0.3, refined: int = 8000, contacts: int = 2) -> Row:
     `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`:
     number of contacts, at most four.
     """
-    on, apart = fem_case.patch(), multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, apart, max_tasks_per_child=1) as pool:
+    surface, context = fem_case.patch(), multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
         costs = list(pool.map(sequence, ("linear", "neo-hookean")))
-    return {"rows": discretisation(on, refined, contacts, load), "laws": law_table(on), "sequence": costs}
+    return {
+        "rows": discretisation(surface, refined, contacts, load),
+        "laws": law_table(surface),
+        "sequence": costs,
+    }
 
 
-def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
+def discretisation(surface: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
     """Rows of law and size: `mesh_error` against the refined mesh at the same nu (linear law; 0.4 and 0.49),
     `error` against refined neo-Hookean at the load."""
     default = ("neo-hookean", schema.FemSection().tets)
     total: dict[tuple[str, int], list[dict[str, float]]] = {setting: [] for setting in _SETTINGS}
     for contact in fem_case.CONTACTS[:contacts]:
-        exact = {nu: _small(on, refined, contact, nu) for nu in (0.4, 0.49)}
-        true = fem_case.brain(on, "neo-hookean", refined, contact)
-        whole = {way: fem_case.moved(true, load, way) for way in ("push", "aside")}
-        meshed: dict[int, dict[str, float]] = {}
+        exact = {nu: _small(surface, refined, contact, nu) for nu in (0.4, 0.49)}
+        reference_case = fem_case.brain(surface, "neo-hookean", refined, contact)
+        reference = {
+            direction: fem_case.displace(reference_case, load, direction) for direction in ("push", "aside")
+        }
+        mesh_errors: dict[int, dict[str, float]] = {}
         for law, tets in _SETTINGS:
-            if tets not in meshed:
-                meshed[tets] = {
-                    name: _mean_error(_small(on, tets, contact, nu), exact[nu], on)
+            if tets not in mesh_errors:
+                mesh_errors[tets] = {
+                    name: _mean_error(_small(surface, tets, contact, nu), exact[nu], surface)
                     for nu, name in ((0.4, "mesh_error"), (0.49, "mesh_error_049"))
                 }
-            case = fem_case.brain(on, law, tets, contact)
+            case = fem_case.brain(surface, law, tets, contact)
             error = speed = float("nan")  # past the law's range
             with suppress(InvertedElement, NoEquilibrium):
-                error = _mean_error({way: fem_case.moved(case, load, way) for way in whole}, whole, on)
+                error = _mean_error(
+                    {direction: fem_case.displace(case, load, direction) for direction in reference},
+                    reference,
+                    surface,
+                )
                 speed = fem_case.speed(case, load, "push")
-            total[law, tets].append(meshed[tets] | {"error": error, "ms_a_frame": speed})
+            total[law, tets].append(mesh_errors[tets] | {"error": error, "ms_a_frame": speed})
     return [
         {"law": law, "tets": tets, "default": (law, tets) == default}
         | {name: _mean([row[name] for row in rows]) for name in rows[0]}
@@ -82,65 +92,67 @@ def _mean(values: list[float]) -> float | None:
 
 
 def _small(
-    on: fem_case.Patch, tets: int, contact: tuple[float, float, float], poisson: float
+    surface: fem_case.Patch, tets: int, contact: tuple[float, float, float], poisson: float
 ) -> dict[str, Floats]:
     """Displacement by direction under the linear law."""
-    case = fem_case.brain(on, "linear", tets, contact, poisson)
-    return {way: fem_case.moved(case, 0.1, way, 1) for way in ("pull", "aside")}
+    case = fem_case.brain(surface, "linear", tets, contact, poisson)
+    return {direction: fem_case.displace(case, 0.1, direction, 1) for direction in ("pull", "aside")}
 
 
-def _mean_error(u: Mapping[str, Floats], exact: Mapping[str, Floats], on: fem_case.Patch) -> float:
-    return float(np.mean([fem_case.error(u[way], exact[way], on) for way in exact]))
+def _mean_error(u: Mapping[str, Floats], exact: Mapping[str, Floats], surface: fem_case.Patch) -> float:
+    return float(np.mean([fem_case.error(u[direction], exact[direction], surface) for direction in exact]))
 
 
-def law_table(on: fem_case.Patch) -> list[Row]:
+def law_table(surface: fem_case.Patch) -> list[Row]:
     """Error of each law against neo-Hookean on the same mesh, by load and direction; None past its range."""
-    cases = {law: fem_case.brain(on, law, 1600, fem_case.CONTACTS[0]) for law in NUMBER}
+    cases = {law: fem_case.brain(surface, law, 1600, fem_case.CONTACTS[0]) for law in NUMBER}
     rows: list[Row] = []
     for load in _LOADS:
-        for way in fem_case.WAYS:
-            moved: dict[str, Floats] = {}
+        for direction in fem_case.DIRECTIONS:
+            displacements: dict[str, Floats] = {}
             for law, case in cases.items():
                 with suppress(InvertedElement, NoEquilibrium):
-                    moved[law] = fem_case.moved(case, load, way, 6)
-            true = moved.pop("neo-hookean", None)
+                    displacements[law] = fem_case.displace(case, load, direction, 6)
+            reference = displacements.pop("neo-hookean", None)
             for law in (law for law in NUMBER if law != "neo-hookean"):
                 error = None
-                if true is not None and law in moved:
-                    error = fem_case.error(moved[law], true, on)
-                rows.append({"law": law, "load": load, "way": way, "error": error})
+                if reference is not None and law in displacements:
+                    error = fem_case.error(displacements[law], reference, surface)
+                rows.append({"law": law, "load": load, "way": direction, "error": error})
     return rows
 
 
 def sequence(law: str) -> Row:
     """CPU time and peak memory of this process for mesh and mechanics, 60 frames of 40,000 vertices."""
-    on, load = fem_case.patch(), 0.15
+    surface, load = fem_case.patch(), 0.15
     fem = schema.FemSection(gestures=("pull",), load=(load, load))
     gesture, tissue = fem_case.pull(fem), Tissue(1.0, 0.4, law)
     start = time.process_time()
     volume = tetrahedra.block(fem.tets, gesture.focus)
-    meshed = time.process_time()
-    solver.deform(read_scheme(fem), tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
-    spent = 1e3 * (time.process_time() - meshed) / _FRAMES
+    mesh_end = time.process_time()
+    solver.deform(
+        read_scheme(fem), tissue, [gesture], volume, Shape(surface.vertices, surface.faces), _FRAMES, 25.0
+    )
+    ms_a_frame = 1e3 * (time.process_time() - mesh_end) / _FRAMES
     # The kernel's high-water mark; getrusage would include the parent's memory before exec.
     status = Path("/proc/self/status").read_text("utf-8")
     peak = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
-    row: Row = {"law": law, "load": load, "mesh_s": meshed - start, "ms_a_frame": spent}
+    row: Row = {"law": law, "load": load, "mesh_s": mesh_end - start, "ms_a_frame": ms_a_frame}
     return row | {"peak_rss_mb": peak * 1024 / 1e6}
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Error of mesh and law against cost, and the largest error of each law by load."""
-    rows = [row | {"error %": 100 * row["error"]} for row in found["rows"] if row["error"] is not None]
+    rows = [row | {"error %": 100 * row["error"]} for row in data["rows"] if row["error"] is not None]
 
     def draw_cost(axes: Axes) -> None:
-        groups = {law: own for (law,), own in report.grouped(rows, "law").items()}
+        groups = {law: law_rows for (law,), law_rows in report.group_rows(rows, "law").items()}
         axes.set(xlabel="CPU ms a frame", ylabel="error [%]", xscale="log", yscale="log")
         report.scatter(axes, groups, "ms_a_frame", "error %", "{law}, {tets}")
         report.set_log(axes)
         report.legend(axes)
 
-    worst = worst_by_load(found["laws"])
+    worst = worst_by_load(data["laws"])
 
     def draw_laws(axes: Axes) -> None:
         for law, by_load in worst.items():
@@ -159,21 +171,21 @@ def page(found: Mapping[str, Any]) -> report.Page:
         for law, by_load in worst.items()
     ]
     sections = [
-        report.Section("Meshes and laws", found["rows"]),
+        report.Section("Meshes and laws", data["rows"]),
         report.Section("Error of a law against neo-Hookean, by load", laws, ("Worst direction:",)),
-        report.Section("A sequence", found["sequence"]),
+        report.Section("A sequence", data["sequence"]),
     ]
     chart = report.chart(draw_cost, draw_laws)
-    return report.Page("Physics: error against cost", found, words, sections, chart)
+    return report.Page("Physics: error against cost", data, words, sections, chart)
 
 
 def worst_by_load(rows: Sequence[Row]) -> dict[str, dict[float, float]]:
     """Of each law and load P the largest error over directions, of loads that every direction solves."""
-    found: dict[str, dict[float, float]] = {}
-    for (law, load), own in report.grouped(rows, "law", "load").items():
-        if None not in (errors := [row["error"] for row in own]):
-            found.setdefault(law, {})[load] = max(errors)
-    return found
+    largest: dict[str, dict[float, float]] = {}
+    for (law, load), group in report.group_rows(rows, "law", "load").items():
+        if None not in (errors := [row["error"] for row in group]):
+            largest.setdefault(law, {})[load] = max(errors)
+    return largest
 
 
 STUDY = Study(measure, "fem/pareto/pareto.json", page, needs=("mesh", "mechanics"), timed=True)

@@ -37,11 +37,11 @@ def measure_scene(index: int, count: int) -> Row:
     gesture, height = case.gestures[0], HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
     volume = tetrahedra.block(count, gesture.focus, height)
-    moved = tool_gesture.trajectory(gesture, _JOB.frames)
-    full = int(moved.load.argmax())
-    moved = tool_gesture.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])
+    motion = tool_gesture.trajectory(gesture, _JOB.frames)
+    peak = int(motion.load.argmax())
+    motion = tool_gesture.ToolMotion(np.ones(1), motion.away[[peak]], motion.shift[[peak]])
     area = rest.vertex_area
-    traction = tool_gesture.tractions(gesture, moved, surface.vertices, area)[0]
+    traction = tool_gesture.tractions(gesture, motion, surface.vertices, area)[0]
     force = area[:, None] * traction / case.tissue.young_kpa
     embedding = surface_embedding.embed(volume, surface.vertices)
     parts = np.array([0.5, 1.0])
@@ -60,31 +60,34 @@ def measure_scene(index: int, count: int) -> Row:
 
 def summarise(rows: list[Row], sizes: list[int]) -> list[Row]:
     """Median and worst deviation from the finest mesh, over scenes that converge on it."""
-    made = []
+    lines = []
     exact = {r["index"]: r for r in rows if r["tets"] == sizes[-1] and "peak_mm" in r}
     for count in sizes[:-1]:
-        ours = [r for r in rows if r["tets"] == count and "peak_mm" in r and r["index"] in exact]
-        line: Row = {"tets": count, "against": sizes[-1], "scenes": len(ours)}
-        for name in ("peak_mm", "mean_mm") if ours else ():
-            off = np.abs([r[name] / exact[r["index"]][name] - 1 for r in ours])
-            line |= {f"{name[:4]}_median": float(np.median(off)), f"{name[:4]}_worst": float(off.max())}
-        made.append(line)
-    return made
+        converged = [r for r in rows if r["tets"] == count and "peak_mm" in r and r["index"] in exact]
+        line: Row = {"tets": count, "against": sizes[-1], "scenes": len(converged)}
+        for name in ("peak_mm", "mean_mm") if converged else ():
+            deviation = np.abs([r[name] / exact[r["index"]][name] - 1 for r in converged])
+            line |= {
+                f"{name[:4]}_median": float(np.median(deviation)),
+                f"{name[:4]}_worst": float(deviation.max()),
+            }
+        lines.append(line)
+    return lines
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Deviation from the finest mesh, by number of tetrahedra."""
-    rows = [row for row in found["summary"] if row["scenes"]]
+    rows = [row for row in data["summary"] if row["scenes"]]
 
     def draw(axes: Axes) -> None:
-        for kind, which in product(("peak", "mean"), ("median", "worst")):
-            errors = [100 * row[f"{kind}_{which}"] for row in rows]
-            axes.plot([row["tets"] for row in rows], errors, "-o", label=f"{kind}, {which}")
+        for kind, statistic in product(("peak", "mean"), ("median", "worst")):
+            errors = [100 * row[f"{kind}_{statistic}"] for row in rows]
+            axes.plot([row["tets"] for row in rows], errors, "-o", label=f"{kind}, {statistic}")
         axes.set(xlabel="tetrahedra", ylabel="displacement [%]", ylim=(0, None))
         report.legend(axes)
 
-    title, sections = "Default scenes against the finest mesh", [report.Section("Summary", found["summary"])]
-    return report.Page(title, found, (), sections, report.chart(draw))
+    title, sections = "Default scenes against the finest mesh", [report.Section("Summary", data["summary"])]
+    return report.Page(title, data, (), sections, report.chart(draw))
 
 
 STUDY = Study(measure, "fem/relief/relief.json", page, needs=("mesh", "mechanics"))

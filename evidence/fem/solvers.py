@@ -51,17 +51,17 @@ def measure(tets: int = 2400, tets_wide: int = 3200) -> Row:
 def compare_driven(scene: Mapping[str, Any], tets: int) -> Row:
     """A disc that holds the tissue and is driven: `force_error`, relative to felupe's, and `motion_error`,
     the largest at `scene["places"]` relative to the largest motion."""
-    way, motion = np.array(scene["way"]), np.array(scene["displacement"])
+    travel, reference = np.array(scene["way"]), np.array(scene["displacement"])
     places = np.array(scene["places"])
-    force, moved = drive(scene["radius"], way, scene["poisson"], scene["alpha"], places, tets)
-    wanted = np.array(scene["reaction"])
+    force, motion = drive(scene["radius"], travel, scene["poisson"], scene["alpha"], places, tets)
+    reaction = np.array(scene["reaction"])
     return {
         "radius_mm": scene["radius"],
         "alpha": scene["alpha"],
         "way_mm": scene["way"],
-        "strength": float(np.linalg.norm(wanted) / scene["radius"] ** 2),  # P = F / (E a²)
-        "force_error": float(np.linalg.norm(force - wanted) / np.linalg.norm(wanted)),
-        "motion_error": float(np.abs(moved - motion).max() / np.linalg.norm(motion, axis=1).max()),
+        "strength": float(np.linalg.norm(reaction) / scene["radius"] ** 2),  # P = F / (E a²)
+        "force_error": float(np.linalg.norm(force - reaction) / np.linalg.norm(reaction)),
+        "motion_error": float(np.abs(motion - reference).max() / np.linalg.norm(reference, axis=1).max()),
     }
 
 
@@ -70,12 +70,12 @@ def compare_ball(scene: Mapping[str, Any], tets: int = 2400) -> Row:
     felupe's, and `motion_error` beside it, relative to the depth, at equal force."""
     x, depth = np.array(scene["places"]), scene["depth"]
     places = np.column_stack([x, 0 * x, 0 * x])
-    way = np.array([0.0, 0.0, -depth])
-    force, moved = drive(scene["touched"], way, scene["poisson"], scene["alpha"], places, tets)
+    travel = np.array([0.0, 0.0, -depth])
+    force, displacement = drive(scene["touched"], travel, scene["poisson"], scene["alpha"], places, tets)
     factor = float(force[2] / scene["reaction"][2])
-    apart = np.linalg.norm(moved / factor - scene["displacement"], axis=1)
-    beside = x > 1.2 * scene["touched"]
-    return {"depth_mm": depth, "force": factor, "motion_error": float(apart[beside].max() / depth)}
+    differences = np.linalg.norm(displacement / factor - scene["displacement"], axis=1)
+    is_beside = x > 1.2 * scene["touched"]
+    return {"depth_mm": depth, "force": factor, "motion_error": float(differences[is_beside].max() / depth)}
 
 
 def compare_estimate(scene: Mapping[str, Any]) -> Row:
@@ -83,18 +83,18 @@ def compare_estimate(scene: Mapping[str, Any]) -> Row:
     motion of `largest_mm` and of this `slope`."""
     axis = (np.arange(GRID.size) - (GRID.size - 1) / 2) * GRID.pitch_mm
     x, y = np.meshgrid(axis, axis)
-    moved, force = motion_of(scene, x, y)
+    motion, force = motion_of(scene, x, y)
     deviation = np.full((3, *x.shape), 0.01, np.float32)
-    planes = moved.transpose(2, 0, 1).astype(np.float32)
-    seen = large_motion.seen_motion(planes, deviation, np.hypot(x, y) < OPENING_MM, GRID)
-    found = large_motion.reaction(
-        seen, TissueKind("bonded", 0.0, scene["poisson"]), OPENING_MM, scene["alpha"]
+    planes = motion.transpose(2, 0, 1).astype(np.float32)
+    visible_motion = large_motion.measure_motion(planes, deviation, np.hypot(x, y) < OPENING_MM, GRID)
+    reaction = large_motion.reaction(
+        visible_motion, TissueKind("bonded", 0.0, scene["poisson"]), OPENING_MM, scene["alpha"]
     )
     return {
         "alpha": scene["alpha"],
-        "slope": float(seen.slope),
-        "largest_mm": float(np.linalg.norm(moved, axis=-1).max()),
-        "force_error": float(np.linalg.norm(found - force) / np.linalg.norm(force)),
+        "slope": float(visible_motion.slope),
+        "largest_mm": float(np.linalg.norm(motion, axis=-1).max()),
+        "force_error": float(np.linalg.norm(reaction - force) / np.linalg.norm(force)),
     }
 
 
@@ -103,7 +103,9 @@ def flat_block(tets: int, even_mm: float) -> tuple[Tets, Shape]:
     """Felupe's block in about `tets` tetrahedra, finest within `even_mm` of its middle; a fine surface."""
     size = np.array(BLOCK_MM)
     points, cells = tetrahedra.bricks(size, 40)
-    points, cells = refine(points, cells, lambda at: np.maximum(even_mm, np.linalg.norm(at, axis=1)), tets)
+    points, cells = refine(
+        points, cells, lambda places: np.maximum(even_mm, np.linalg.norm(places, axis=1)), tets
+    )
     points, cells = tetrahedra.with_midsides(points, cells)
     fixed = (np.abs(np.abs(points[:, :2]) - 20) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - 20)
     x = np.linspace(-12, 12, 121)
@@ -122,13 +124,15 @@ def drive(
     tissue = Tissue(1.0, poisson, "ogden", alpha=alpha)
     area = surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(mesh, surface.vertices)
-    held = driven_contact.layers([disc], tissue, embedding, surface.vertices, area)
-    base, motion = tissue.equations(mesh), trajectory(disc, 3)
-    path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *mesh.points.shape)))
-    if not np.isclose(path.way[1, 0], length):
-        raise ValueError(f"the disc went {path.way[1, 0]:.3g} of {length:.3g} mm")
+    layers = driven_contact.build_layers([disc], tissue, embedding, surface.vertices, area)
+    equations, motion = tissue.equations(mesh), trajectory(disc, 3)
+    path = driven_contact.follow(
+        equations, 1.0, layers, [motion], Clock(1.0), np.zeros((3, *mesh.points.shape))
+    )
+    if not np.isclose(path.travel[1, 0], length):
+        raise ValueError(f"the disc went {path.travel[1, 0]:.3g} of {length:.3g} mm")
     u = path.displacement[1]
-    return held[0].reaction(u, path.way[1, 0]), surface_embedding.embed(mesh, places).move(u)
+    return layers[0].reaction(u, path.travel[1, 0]), surface_embedding.embed(mesh, places).move(u)
 
 
 def _disc(radius_mm: float, direction: Floats, travel_mm: float) -> Gesture:
@@ -155,18 +159,18 @@ def _disc(radius_mm: float, direction: Floats, travel_mm: float) -> Gesture:
 
 def motion_of(scene: Mapping[str, Any], x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Motion (..., 3) mm at camera x, y [mm] and force (3,) mN of one of felupe's `openings`, camera axes."""
-    places, moved = np.array(scene["places"]), np.array(scene["displacement"])
-    beside = places[:, 1] > 1e-6
-    places = np.concatenate([places, places[beside] * [1, -1]])
-    moved = np.concatenate([moved, moved[beside] * [1, -1, 1]])
-    motion = np.nan_to_num(CloughTocher2DInterpolator(places, moved)(np.stack([x, -y], axis=-1)))
+    places, displacements = np.array(scene["places"]), np.array(scene["displacement"])
+    off_plane = places[:, 1] > 1e-6
+    places = np.concatenate([places, places[off_plane] * [1, -1]])
+    displacements = np.concatenate([displacements, displacements[off_plane] * [1, -1, 1]])
+    motion = np.nan_to_num(CloughTocher2DInterpolator(places, displacements)(np.stack([x, -y], axis=-1)))
     return motion * [1, -1, -1], np.array(scene["reaction"]) * [1, -1, -1]
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """A table of each comparison, and the largest difference of each in words."""
-    worst = {name: max(row["force_error"] for row in found[name]) for name in ("driven", "estimated")} | {
-        "motion": max(row["motion_error"] for row in found["driven"])
+    worst = {name: max(row["force_error"] for row in data[name]) for name in ("driven", "estimated")} | {
+        "motion": max(row["motion_error"] for row in data["driven"])
     }
     driven = [
         {
@@ -178,7 +182,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "force differs by": f"{row['force_error']:.1%}",
             "motion differs by": f"{row['motion_error']:.1%}",
         }
-        for row in found["driven"]
+        for row in data["driven"]
     ]
     balls = [
         {
@@ -186,7 +190,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "force over the ball's": row["force"],
             "motion beside it differs by": f"{row['motion_error']:.1%}",
         }
-        for row in found["balls"]
+        for row in data["balls"]
     ]
     estimated = [
         {
@@ -194,13 +198,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "largest motion [mm]": row["largest_mm"],
             "force differs by": f"{row['force_error']:.1%}",
         }
-        for row in found["estimated"]
+        for row in data["estimated"]
     ]
     return report.Page(
         "An independent solver",
-        found,
+        data,
         (
-            f"**Driven contacts differ from felupe {found['felupe']} by at most {worst['driven']:.1%} in "
+            f"**Driven contacts differ from felupe {data['felupe']} by at most {worst['driven']:.1%} in "
             f"force and {worst['motion']:.1%} in motion; from felupe's motion physics finds its force to "
             f"{worst['estimated']:.1%}.**",
             "felupe solves the same scenes with bricks of 20 nodes, its own Ogden law and its own Newton "

@@ -28,7 +28,12 @@ def measure(count: int = 6, frames: int = 200, seed: int = 2641) -> dict[str, An
 
     `frames`: of the drift sequence, at least 60.
     """
-    rows = [*_warped(count, seed), *_drift(frames, seed), *_contact(5 * count), *_time(seed)]
+    rows = [
+        *_measure_warped(count, seed),
+        *_measure_drift(frames, seed),
+        *_measure_contact(5 * count),
+        *_measure_time(seed),
+    ]
     return {"torch": torch.__version__, "opencv": cv2.__version__, "rows": rows}
 
 
@@ -37,42 +42,44 @@ def row(what: str, on: str, measured: float, target: float | None = None, unit: 
     return {"what": what, "on": on, "target": target, "measured": measured, "unit": unit}
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Draws `results.json`."""
-    limited = [row for row in found["rows"] if row["target"]]
+    limited = [row for row in data["rows"] if row["target"]]
     shares = {f"{row['what']}; {row['on']}": [row["measured"] / row["target"]] for row in limited}
     chart = report.intervals("Target reached if at most 1", "measured / target", shares)
-    met = [row["measured"] <= row["target"] for row in limited]
-    words = [f"**{sum(met)} of {len(met)} targets are reached.**"]
-    sections = [report.Section("", found["rows"])]
-    return report.Page("Flow: measured values and targets", found, words, sections, chart)
+    is_reached = [row["measured"] <= row["target"] for row in limited]
+    words = [f"**{sum(is_reached)} of {len(is_reached)} targets are reached.**"]
+    sections = [report.Section("", data["rows"])]
+    return report.Page("Flow: measured values and targets", data, words, sections, chart)
 
 
-def _warped(count: int, seed: int) -> Iterator[Row]:
+def _measure_warped(count: int, seed: int) -> Iterator[Row]:
     on = "warped procedural cortex"
-    dirty, clean = list(pairs(Recipe(), count, seed)), list(pairs(CLEAN, count, seed))
-    ours = mean_errors(create("tvl1"), dirty)
-    yield row("EPE mean, exact masks", on, ours["mean"], 0.20)
-    yield row("EPE mean of no flow", on, ours["still"])
-    yield row("EPE contact, exact masks", on, ours["contact"], 0.40)
-    yield row("EPE visible part of the contact, exact masks", on, ours["contact_visible"], 0.40)
-    yield row("EPE hidden under the tool, exact masks", on, ours["hidden"], 0.45)
-    yield row("magnitude error", on, ours["magnitude"], 0.06, "share")
-    yield row("divergence, relative RMS", on, ours["divergence"], 0.45, "share")
-    yield row("divergence, 1 - correlation", on, 1 - ours["divergence_r"], 0.10, "share")
+    image_pairs, clean_pairs = list(pairs(Recipe(), count, seed)), list(pairs(CLEAN, count, seed))
+    errors = mean_errors(create("tvl1"), image_pairs)
+    yield row("EPE mean, exact masks", on, errors["mean"], 0.20)
+    yield row("EPE mean of no flow", on, errors["still"])
+    yield row("EPE contact, exact masks", on, errors["contact"], 0.40)
+    yield row("EPE visible part of the contact, exact masks", on, errors["contact_visible"], 0.40)
+    yield row("EPE hidden under the tool, exact masks", on, errors["hidden"], 0.45)
+    yield row("magnitude error", on, errors["magnitude"], 0.06, "share")
+    yield row("divergence, relative RMS", on, errors["divergence"], 0.45, "share")
+    yield row("divergence, 1 - correlation", on, 1 - errors["divergence_r"], 0.10, "share")
     for name in ("opencv-tvl1", "dis"):
-        theirs = mean_errors(create(name), dirty)
-        yield row(f"EPE mean, exact masks: {name}", on, theirs["mean"])
-        yield row(f"divergence, relative RMS: {name}", on, theirs["divergence"], unit="share")
-    unaided = mean_errors(create("tvl1"), dirty, detected=True)["mean"]
-    yield row("EPE automatic / exact masks", on, unaided / ours["mean"], 1.25, "ratio")
-    mine, tuned = (mean_errors(create(name), clean) for name in ("tvl1", "opencv-tvl1"))
-    yield row("EPE clean pairs", on, mine["mean"], 0.12)
-    yield row("EPE clean pairs, of no flow", on, mine["still"])
-    yield row("EPE clean pairs / tuned OpenCV TV-L1", on, mine["mean"] / tuned["mean"], 1.3, "ratio")
+        baseline = mean_errors(create(name), image_pairs)
+        yield row(f"EPE mean, exact masks: {name}", on, baseline["mean"])
+        yield row(f"divergence, relative RMS: {name}", on, baseline["divergence"], unit="share")
+    detected_px = mean_errors(create("tvl1"), image_pairs, detected=True)["mean"]
+    yield row("EPE automatic / exact masks", on, detected_px / errors["mean"], 1.25, "ratio")
+    clean_errors, opencv_errors = (mean_errors(create(name), clean_pairs) for name in ("tvl1", "opencv-tvl1"))
+    yield row("EPE clean pairs", on, clean_errors["mean"], 0.12)
+    yield row("EPE clean pairs, of no flow", on, clean_errors["still"])
+    yield row(
+        "EPE clean pairs / tuned OpenCV TV-L1", on, clean_errors["mean"] / opencv_errors["mean"], 1.3, "ratio"
+    )
 
 
-def _drift(frames: int, seed: int) -> Iterator[Row]:
+def _measure_drift(frames: int, seed: int) -> Iterator[Row]:
     """Drift over pulls and releases in cycles of 40 frames: errors at equal phase, early and late."""
     rng = np.random.default_rng([seed, 200])
     stage = Stage(Recipe(peak_px=10 * 192 / 224), 224, rng)
@@ -88,7 +95,7 @@ def _drift(frames: int, seed: int) -> Iterator[Row]:
     yield row("EPE mean, last 20 frames", on, late)
 
 
-def _contact(count: int) -> Iterator[Row]:
+def _measure_contact(count: int) -> Iterator[Row]:
     """Errors at the contact out of distribution, in the frame of the largest force.
 
     Error of a component over visible tissue with a traction above 5% of its largest, and the gain: the slope
@@ -99,18 +106,18 @@ def _contact(count: int) -> Iterator[Row]:
     for index in range(count):
         scene = simulate(job, index)
         frames = [scene.frame(t) for t in range(scene.strongest + 1)]
-        now = frames[-1]
-        size = np.linalg.norm(now.traction, axis=-1)
-        pressed = scene.tissue & now.visible & (size > 0.05 * size.max())
-        true = now.flow[pressed]
+        last = frames[-1]
+        size = np.linalg.norm(last.traction, axis=-1)
+        in_contact = scene.tissue & last.visible & (size > 0.05 * size.max())
+        true = last.flow[in_contact]
         paths = np.stack([frame.flow for frame in frames])
         visible = np.stack([frame.visible & scene.tissue for frame in frames])
         for corrected, rows in figures.items():
             track = scene.recover_flow(frames, Tvl1(corrected=corrected))
-            flow, found = track.flow[-1][pressed], track.confidence >= LOW_CONFIDENCE
+            flow, tracked = track.flow[-1][in_contact], track.confidence >= LOW_CONFIDENCE
             rms = scene.scale_mm_per_px * float(np.sqrt(np.mean((flow - true) ** 2)))
             gain = float((flow * true).sum() / (true * true).sum())
-            rows.append((rms, gain, average_jaccard(epe(track.flow, paths), found, visible)))
+            rows.append((rms, gain, average_jaccard(epe(track.flow, paths), tracked, visible)))
     for corrected, rows in figures.items():
         errors, gains, jaccards = (np.array(column) for column in zip(*rows, strict=True))
         on = f"contact, {count} scenes out of distribution" + ("" if corrected else ", uncorrected")
@@ -122,12 +129,12 @@ def _contact(count: int) -> Iterator[Row]:
         yield row("Average Jaccard of all tissue at 2 to 32 px, mean", on, jaccards.mean(), unit="share")
 
 
-def _time(seed: int) -> Iterator[Row]:
-    some = list(pairs(Recipe(), 5, seed, 256))
-    mean_errors(create("tvl1"), some[:1])  # compiles
+def _measure_time(seed: int) -> Iterator[Row]:
+    image_pairs = list(pairs(Recipe(), 5, seed, 256))
+    mean_errors(create("tvl1"), image_pairs[:1])  # compiles
     on = f"256², one thread, {platform.machine()}"
-    yield row("CPU cold", on, mean_errors(create("tvl1"), some)["cpu_s"], 0.5, "CPU-s")
-    yield row("CPU warm", on, mean_errors(create("tvl1"), some, warm=0.9)["cpu_s"], 0.2, "CPU-s")
+    yield row("CPU cold", on, mean_errors(create("tvl1"), image_pairs)["cpu_s"], 0.5, "CPU-s")
+    yield row("CPU warm", on, mean_errors(create("tvl1"), image_pairs, warm=0.9)["cpu_s"], 0.2, "CPU-s")
 
 
 STUDY = Study(

@@ -55,55 +55,58 @@ def measure(
 def _track(scene: Scene, gesture: str) -> Iterator[Row]:
     """A row of each estimator, pace and frame."""
     shots = [scene.frame(t) for t in range(scene.strongest + 1)]
-    for every in _EVERY:
-        chosen = shots[::every] if shots[::every][-1] is shots[-1] else [*shots[::every], shots[-1]]
+    for stride in _EVERY:
+        subset = shots[::stride] if shots[::stride][-1] is shots[-1] else [*shots[::stride], shots[-1]]
         for name in ESTIMATORS:
-            track = scene.recover_flow(chosen, name)
-            before = 0.0
-            for k, shot in enumerate(chosen[1:], 1):
-                shown = scene.tissue & shot.visible
-                moved, error = np.linalg.norm(shot.flow, axis=-1)[shown], epe(track.flow[k], shot.flow)[shown]
-                sure = (track.confidence[k] >= LOW_CONFIDENCE)[shown]
-                motion = float(np.quantile(moved, _MOST))
+            track = scene.recover_flow(subset, name)
+            previous_motion = 0.0
+            for k, shot in enumerate(subset[1:], 1):
+                visible = scene.tissue & shot.visible
+                lengths = np.linalg.norm(shot.flow, axis=-1)[visible]
+                error = epe(track.flow[k], shot.flow)[visible]
+                confident = (track.confidence[k] >= LOW_CONFIDENCE)[visible]
+                motion = float(np.quantile(lengths, _MOST))
                 yield {
                     "gesture": gesture,
                     "estimator": name,
                     "motion": motion,
-                    "step": abs(motion - before),
+                    "step": abs(motion - previous_motion),
                     "error": float(np.median(error)),
-                    "error at the contact": float(np.mean(error[moved > 0.5 * motion])),
-                    "no flow": float(np.mean(moved[moved > 0.5 * motion])),
-                    "lost": float(1 - sure.mean()),
-                    "wrong and sure": float((sure & (error > _WRONG_PX)).mean()),
+                    "error at the contact": float(np.mean(error[lengths > 0.5 * motion])),
+                    "no flow": float(np.mean(lengths[lengths > 0.5 * motion])),
+                    "lost": float(1 - confident.mean()),
+                    "wrong and sure": float((confident & (error > _WRONG_PX)).mean()),
                 }
-                before = motion
+                previous_motion = motion
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Error against motion for each size of step, and all means."""
     rows = [
         row
         | {"motion [px]": _nearest(row["motion"], _MOTION_PX), "step [px]": _nearest(row["step"], _STEP_PX)}
-        for row in found["rows"]
+        for row in data["rows"]
         if row["motion"] > _MOTION_PX[0] / np.sqrt(2)
     ]
     keys = "error", "error at the contact", "no flow", "lost", "wrong and sure"
-    groups = report.grouped(rows, "estimator", "step [px]", "motion [px]")
+    groups = report.group_rows(rows, "estimator", "step [px]", "motion [px]")
     table = [
         {"estimator": name, "step [px]": step, "motion [px]": motion, "frames": len(part)}
         | {key: float(np.mean([row[key] for row in part])) for key in keys}
         for (name, step, motion), part in sorted(groups.items())
     ]
-    ours = [row for row in rows if row["estimator"] == ESTIMATORS[0]]
-    usual = [row for row in ours if row["step [px]"] <= _STEP_PX[1]]
-    middle = np.median([row["error"] for row in usual])
-    wrong, wrong_all = (np.mean([row["wrong and sure"] for row in part]) for part in (usual, ours))
+    default_rows = [row for row in rows if row["estimator"] == ESTIMATORS[0]]
+    small_steps = [row for row in default_rows if row["step [px]"] <= _STEP_PX[1]]
+    middle = np.median([row["error"] for row in small_steps])
+    wrong, wrong_all = (
+        np.mean([row["wrong and sure"] for row in part]) for part in (small_steps, default_rows)
+    )
     words = (
         f"**In steps of up to {_STEP_PX[1]} px `{ESTIMATORS[0]}` errs {middle:.2f} px (median of the "
         f"frames' medians over visible tissue); {wrong:.1%} of it is sure and off by over {_WRONG_PX:g} "
         f"px, in all steps {wrong_all:.1%}.**",
-        f"A retraction, a grasp and a press of {found['travel_mm']:g} mm by the job `clinical`, 640 px of "
-        f"{found['field_mm']:g} mm, {found['frames']} frames in two seconds, up to their largest motion; "
+        f"A retraction, a grasp and a press of {data['travel_mm']:g} mm by the job `clinical`, 640 px of "
+        f"{data['field_mm']:g} mm, {data['frames']} frames in two seconds, up to their largest motion; "
         "with every frame and every second, fourth and eighth. Errors in px: *error*, median over visible "
         "tissue; *at the contact*, "
         "mean where tissue moves more than half as far as the farthest; *no flow*, the error there of "
@@ -114,11 +117,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         lambda axes: _draw(axes, table, "error at the contact", "error at the contact [px]"),
         lambda axes: _draw(axes, table, "lost", "share lost"),
     )
-    return report.Page("Flow at large motion", found, words, [report.Section("", table)], chart)
+    return report.Page("Flow at large motion", data, words, [report.Section("", table)], chart)
 
 
-def _nearest(value: float, among: tuple[int, ...]) -> int:
-    return min(among, key=lambda size: abs(np.log(max(value, 1e-3) / size)))
+def _nearest(value: float, candidates: tuple[int, ...]) -> int:
+    return min(candidates, key=lambda size: abs(np.log(max(value, 1e-3) / size)))
 
 
 def _draw(axes: Axes, table: list[Row], key: str, label: str) -> None:

@@ -21,15 +21,17 @@ def epe(flow: Map, truth: Map) -> Map:
     return np.asarray(np.linalg.norm(flow - truth, axis=-1), np.float32)
 
 
-def average_jaccard(error: Map, found: Mask, visible: Mask) -> float:
+def average_jaccard(error: Map, tracked: Mask, visible: Mask) -> float:
     """Average Jaccard of tracked points (C. Doersch et al., TAP-Vid, NeurIPS 2022) at STIR's thresholds.
 
-    `error`: endpoint error [px] of any shape; `found`, `visible`: whether points are tracked and visible.
+    `error`: endpoint error [px] of any shape; `tracked`, `visible`: whether points are tracked and visible.
     """
     shares = []
     for threshold in _JACCARD_PX:
-        right = found & visible & (error < threshold)
-        shares.append(right.sum() / max(1, np.count_nonzero(visible) + np.count_nonzero(found & ~right)))
+        correct = tracked & visible & (error < threshold)
+        shares.append(
+            correct.sum() / max(1, np.count_nonzero(visible) + np.count_nonzero(tracked & ~correct))
+        )
     return float(np.mean(shares))
 
 
@@ -50,18 +52,20 @@ def errors(flow: Map, pair: Pair) -> Errors:
         over visible pixels.
     """
     error, visible = epe(flow, pair.flow), pair.inside & ~pair.hidden
-    size, real = np.linalg.norm(flow, axis=-1)[visible], np.linalg.norm(pair.flow, axis=-1)[visible]
-    found, true = divergence(flow)[visible], divergence(pair.flow)[visible]
+    lengths, true_lengths = (np.linalg.norm(field, axis=-1)[visible] for field in (flow, pair.flow))
+    recovered, true = divergence(flow)[visible], divergence(pair.flow)[visible]
     spread = float(np.sqrt(np.mean(true**2)))
     return {
         "mean": float(error[visible].mean()),
-        "still": float(real.mean()),
+        "still": float(true_lengths.mean()),
         "contact": _mean(error[pair.contact]),
         "contact_visible": _mean(error[pair.contact & visible]),
         "hidden": _mean(error[pair.hidden]),
-        "magnitude": float(np.abs(size - real).mean() / max(float(real.mean()), 1e-9)),
-        "divergence": float(np.sqrt(np.mean((found - true) ** 2)) / max(spread, 1e-9)),
-        "divergence_r": float(np.corrcoef(found, true)[0, 1]) if spread > 0 and found.std() > 0 else 0.0,
+        "magnitude": float(np.abs(lengths - true_lengths).mean() / max(float(true_lengths.mean()), 1e-9)),
+        "divergence": float(np.sqrt(np.mean((recovered - true) ** 2)) / max(spread, 1e-9)),
+        "divergence_r": float(np.corrcoef(recovered, true)[0, 1])
+        if spread > 0 and recovered.std() > 0
+        else 0.0,
     }
 
 
@@ -87,6 +91,6 @@ def mean_errors(
 
 
 def _mean(values: Sequence[float] | Array) -> float:
-    good = np.asarray(values)
-    good = good[np.isfinite(good)]
-    return float(good.mean()) if len(good) else float("nan")
+    finite = np.asarray(values)
+    finite = finite[np.isfinite(finite)]
+    return float(finite.mean()) if len(finite) else float("nan")

@@ -22,12 +22,12 @@ def measure(count: int = 4, seed: int = 2613, also: str = "") -> dict[str, Any]:
 
     `also`: names of further estimators, separated by commas.
     """
-    made = list(pairs(Recipe(), count, seed))
+    image_pairs = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
     others = [(name, "", create(name), None) for name in also.split(",") if name]
     for family, label, estimator, warm in [*_candidates(), *others]:
-        about = {"family": family, "setting": label, "default": "(default)" in label}
-        rows.append(about | mean_errors(estimator, made, warm=warm))
+        labels = {"family": family, "setting": label, "default": "(default)" in label}
+        rows.append(labels | mean_errors(estimator, image_pairs, warm=warm))
     on = "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread"
     return {"on": on, "torch": torch.__version__, "opencv": cv2.__version__, "rows": rows}
 
@@ -35,7 +35,7 @@ def measure(count: int = 4, seed: int = 2613, also: str = "") -> dict[str, Any]:
 def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     """(family, setting, estimator, share of the true flow to start from)."""
     s = TVL1Settings()
-    ours = {
+    variants = {
         "warps 2": replace(s, warps=2),
         "cold (default)": s,
         "warps 6, steps 16": replace(s, warps=6, steps=16, coarse_warps=6),
@@ -48,22 +48,26 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
         "no membrane": replace(s, hidden_huber=0.0),
     }
     warm = {"warm 2 warps": replace(s, warps=2), "warm (default)": s}
-    theirs = {f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)}
+    opencv_variants = {
+        f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)
+    }
     return [
-        *(("tvl1", label, Tvl1(setting), None) for label, setting in ours.items()),
+        *(("tvl1", label, Tvl1(setting), None) for label, setting in variants.items()),
         ("tvl1", "uncorrected", Tvl1(s, corrected=False), None),
         *(("tvl1 warm", label, Tvl1(setting), 0.9) for label, setting in warm.items()),
-        *(("opencv-tvl1", label, estimator, None) for label, estimator in theirs.items()),
+        *(("opencv-tvl1", label, estimator, None) for label, estimator in opencv_variants.items()),
         ("dis", "medium", Dis(), None),
     ]
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Draws `pareto.json`."""
-    groups = {family: own for (family,), own in report.grouped(found["rows"], "family").items()}
+    groups = {
+        family: family_rows for (family,), family_rows in report.group_rows(data["rows"], "family").items()
+    }
 
-    def draw(axes: Axes, key: str, what: str) -> None:
-        axes.set(xlabel="CPU time [s]", ylabel=what, xscale="log", yscale="log")
+    def draw(axes: Axes, key: str, label: str) -> None:
+        axes.set(xlabel="CPU time [s]", ylabel=label, xscale="log", yscale="log")
         report.scatter(axes, groups, "cpu_s", key, "{setting}")
         report.set_log(axes)
         report.legend(axes)
@@ -72,16 +76,16 @@ def page(found: Mapping[str, Any]) -> report.Page:
         lambda axes: draw(axes, "mean", "mean endpoint error [px]"),
         lambda axes: draw(axes, "divergence", "divergence, relative RMS error"),
     )
-    shown = ("family", "setting", "default", "mean", "contact", "divergence", "cpu_s")
-    rows = [{key: row[key] for key in shown} for row in found["rows"]]
+    columns = ("family", "setting", "default", "mean", "contact", "divergence", "cpu_s")
+    rows = [{key: row[key] for key in columns} for row in data["rows"]]
     best = min(rows, key=lambda row: float(row["mean"]))
-    still = found["rows"][0]["still"]
+    still = data["rows"][0]["still"]
     words = [
         f"**Least endpoint error: {best['family']}, {best['setting']}, {best['mean']:.3f} px in "
         f"{best['cpu_s']:.3f} CPU-s; of no flow {still:.1f} px.** Errors in px, of the divergence relative "
-        f"to its RMS; {found['on']}."
+        f"to its RMS; {data['on']}."
     ]
-    return report.Page("Flow: error against time", found, words, [report.Section("", rows)], chart)
+    return report.Page("Flow: error against time", data, words, [report.Section("", rows)], chart)
 
 
 STUDY = Study(

@@ -99,7 +99,7 @@ class Pair:
     @classmethod
     def of(cls, rest: Frame, now: Frame) -> Pair:
         """Two frames of a video."""
-        tool, there = dilated(now.tool, 3), inside(now.flow)
+        tool, in_view = dilate(now.tool, 3), inside(now.flow)
         length = np.linalg.norm(now.flow, axis=-1)
         return cls(
             rest=rest.rgb,
@@ -107,9 +107,9 @@ class Pair:
             flow=now.flow,
             rest_usable=~rest.glare,
             now_usable=~(tool | now.glare),
-            hidden=(at_rest(tool, now.flow) > 0.5) & there,
-            contact=(length > 0.7 * length.max()) & there,
-            inside=there,
+            hidden=(warp_to_rest(tool, now.flow) > 0.5) & in_view,
+            contact=(length > 0.7 * length.max()) & in_view,
+            inside=in_view,
         )
 
 
@@ -130,19 +130,19 @@ def recipes(half: str, count: int, first: int = 0) -> list[Recipe]:
 def _recipe(index: int, surfaces: list[str]) -> Recipe:
     rng = np.random.default_rng([1804, index])
     number = index // 2
-    some = rng.random(8)
+    draws = rng.random(8)
     return Recipe(
         index=index,
         # In turn, so that few videos contain all surfaces and tools; 3 and 7 are coprime.
         surface=surfaces[number % len(surfaces)],
         tool=["", *_TOOLS][(3 * number + number // 7) % 7],
-        tool_at_rest=bool(some[0] < 0.25),
+        tool_at_rest=bool(draws[0] < 0.25),
         motion=_MOTIONS[(2 * number + number // 5) % 5],
         peak_px=float(np.exp(rng.uniform(np.log(1.5), np.log(10)))),
         lamp=list(_LAMPS)[int(rng.choice(3, p=[0.6, 0.25, 0.15]))],
-        glare=float(rng.uniform(0.01, 0.08)) if some[1] < 0.35 else 0.0,
-        scope=bool(some[2] < 0.2),
-        mono=bool(some[3] < 0.2),
+        glare=float(rng.uniform(0.01, 0.08)) if draws[1] < 0.35 else 0.0,
+        scope=bool(draws[2] < 0.2),
+        mono=bool(draws[3] < 0.2),
         quality=int(rng.choice([0, 95, 75, 40])),
         noise=float(rng.choice([0.5, 1.5, 4.0])),
         faults=tuple(name for name in _FAULTS if rng.random() < 0.22),
@@ -158,7 +158,7 @@ def _surface(name: str, size: int, rng: np.random.Generator) -> Map:
     """Cubic-spline coefficients (3, N, N) of a low-pass filtered image, `_FINE` samples a pixel, of
     (size + 2 margins) px a side."""
     fine = _FINE * (size + 2 * _MARGIN)
-    picture = _drawn(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
+    picture = _draw_phantom(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.55 * _FINE)
     return np.stack([spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)])
 
@@ -176,11 +176,13 @@ def _photograph(name: str, fine: int) -> Map:
     top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
     square = picture[top : top + side, left : left + side].astype(np.float32)
     square = square / (255 if picture.dtype == np.uint8 else max(float(square.max()), 1.0))
-    ways = cv2.INTER_AREA if side > fine else cv2.INTER_CUBIC
-    return np.asarray(np.clip(cv2.resize(square, (fine, fine), interpolation=ways), 0, 1), np.float32)
+    interpolation = cv2.INTER_AREA if side > fine else cv2.INTER_CUBIC
+    return np.asarray(
+        np.clip(cv2.resize(square, (fine, fine), interpolation=interpolation), 0, 1), np.float32
+    )
 
 
-def _drawn(name: str, fine: int, rng: np.random.Generator) -> Map:
+def _draw_phantom(name: str, fine: int, rng: np.random.Generator) -> Map:
     """Image of a phantom, (fine, fine, 3) in 0..1."""
     shape = (fine, fine)
     paper = 1 + 0.02 * noise_field(shape, 60, rng)
@@ -188,7 +190,9 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Map:
         return cortex(fine, rng, fine / _FINE - 2 * _MARGIN)
     if name == "dots":  # dark dots on a light silicone membrane, or white ones on a dark one
         light, ink = ((0.82, 0.80, 0.74), 0.10) if rng.random() < 0.5 else ((0.14, 0.13, 0.13), 0.95)
-        return _over(np.array(light) * paper[..., None], _dots(fine, rng, 16 * _FINE / 2, 3.0 * _FINE), ink)
+        return _blend(
+            np.array(light) * paper[..., None], _draw_dots(fine, rng, 16 * _FINE / 2, 3.0 * _FINE), ink
+        )
     if name == "speckle":
         grains = (noise_field(shape, 3.2 * _FINE, rng) > 0.1).astype(np.float32)
         grains = cv2.GaussianBlur(grains, (0, 0), 0.4 * _FINE)
@@ -205,21 +209,21 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Map:
     noise = noise_field(shape, 5 * _FINE, rng) + noise_field(shape, 24 * _FINE, rng)
     body = level * paper + 0.5 * grain * noise
     picture = np.repeat(body[..., None], 3, -1) * np.array([1.0, 0.99, 0.97])
-    marks = _dots(fine, rng, 22 * _FINE, 1.5 * _FINE)
-    return _over(picture, 0.7 * marks, 0.25 if level > 0.4 else 0.45)
+    marks = _draw_dots(fine, rng, 22 * _FINE, 1.5 * _FINE)
+    return _blend(picture, 0.7 * marks, 0.25 if level > 0.4 else 0.45)
 
 
-def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Map:
+def _draw_dots(fine: int, rng: np.random.Generator, spacing: float, radius: float) -> Map:
     """Coverage in 0..1 by discs on a jittered grid, (fine, fine)."""
     cover = np.zeros((fine, fine), np.uint8)
-    line = np.arange(0, fine, apart)
+    line = np.arange(0, fine, spacing)
     for corner in np.stack(np.meshgrid(line, line), -1).reshape(-1, 2):
-        centre = 16 * (corner + rng.uniform(-0.3, 0.3, 2) * apart)
+        centre = 16 * (corner + rng.uniform(-0.3, 0.3, 2) * spacing)
         cv2.circle(cover, tuple(centre.astype(int).tolist()), int(16 * radius), 255, -1, cv2.LINE_AA, 4)
     return np.asarray(cover / 255, np.float32)
 
 
-def _over(picture: Array, cover: Map, ink: float) -> Map:
+def _blend(picture: Array, cover: Map, ink: float) -> Map:
     return np.asarray(np.clip(picture + cover[..., None] * (ink - picture), 0, 1), np.float32)
 
 
@@ -230,7 +234,7 @@ class Field:
     motion: str
     centre: Floats  # (2,) px
     radius: float  # px
-    way: Floats  # (2,) unit vector
+    direction: Floats  # (2,) unit vector
 
     @classmethod
     def draw(cls, motion: str, size: int, rng: np.random.Generator, reach: float = 0.0) -> Field:
@@ -241,14 +245,14 @@ class Field:
 
     def at(self, place: Map) -> Map:
         """Displacement (..., 2) px at places (..., 2) px."""
-        away = place - self.centre
-        square = (away**2).sum(-1, keepdims=True) / self.radius**2
+        offset = place - self.centre
+        square = (offset**2).sum(-1, keepdims=True) / self.radius**2
         if self.motion == "shift":
-            return np.asarray(np.broadcast_to(self.way, place.shape), np.float32)
+            return np.asarray(np.broadcast_to(self.direction, place.shape), np.float32)
         if self.motion == "pull":  # as under a point load on a half-space, level within the contact
-            return np.asarray(self.way * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
+            return np.asarray(self.direction * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
         # r exp(-r²/2R²) is largest at R, where it is R exp(-1/2).
-        radial = away / self.radius * np.exp(0.5 - 0.5 * square)
+        radial = offset / self.radius * np.exp(0.5 - 0.5 * square)
         if self.motion == "twist":
             return np.asarray(np.stack([-radial[..., 1], radial[..., 0]], -1), np.float32)
         return np.asarray(radial if self.motion == "press from behind" else -radial, np.float32)
@@ -295,7 +299,7 @@ class Stage:
         self.drift, self.angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
         blank = np.zeros((*shape, 3), np.float32)
         glare, tool = self._shine(blank, 0.0)[1], self._tool(blank, 0.0, blank[..., :2])[1]
-        self.rest_blocked = dilated(glare | tool, _RIM)
+        self.rest_blocked = dilate(glare | tool, _RIM)
 
     def shoot(self, amplitude: float, fault: str, rng: np.random.Generator) -> Frame:
         """One frame."""
@@ -303,19 +307,19 @@ class Stage:
         grid = pixels(size, size)
         jump = np.array([18.0, -11.0]) * size / 192 if fault == "jump" else np.zeros(2)
 
-        def moved(at: Map) -> Map:
-            return np.asarray(amplitude * self.peak_px * self.field.at(at) + jump, np.float32)
+        def displace(points: Map) -> Map:
+            return np.asarray(amplitude * self.peak_px * self.field.at(points) + jump, np.float32)
 
         source = grid
         # s = y - u(s): a contraction, as |grad u| < 1; float32 is too coarse to come closer than 1e-4 px.
-        most, near = (40, 0.0) if recipe.slope <= 0.5 else (400, 1e-4)
-        for _ in range(most):
-            before, source = source, grid - moved(source)
-            if np.abs(source - before).max() <= near:
+        iterations, tolerance = (40, 0.0) if recipe.slope <= 0.5 else (400, 1e-4)
+        for _ in range(iterations):
+            previous, source = source, grid - displace(source)
+            if np.abs(source - previous).max() <= tolerance:
                 break
-        flow = moved(grid)
-        where = [(source[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
-        skin = [map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.skin]
+        flow = displace(grid)
+        coordinates = [(source[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
+        skin = [map_coordinates(c, coordinates, order=3, mode="mirror", prefilter=False) for c in self.skin]
         bulge = 1 + recipe.bulge * amplitude * np.exp(
             -((grid - self.field.centre) ** 2).sum(-1) / (0.3 * size) ** 2
         )
@@ -338,10 +342,10 @@ class Stage:
         if fault == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
         picture = picture.mean(-1, keepdims=True) if recipe.mono else picture
-        rgb = sensed(255 * np.asarray(picture, np.float32), recipe.noise, rng)
+        rgb = add_noise(255 * np.asarray(picture, np.float32), recipe.noise, rng)
         rgb = jpeg(np.repeat(rgb, 3 // rgb.shape[-1], -1), recipe.quality)
-        free = scope & ~dilated(glare | tool, _RIM) & ~cover
-        visible = (at_rest(free, flow) > 0.99) & scope & ~self.rest_blocked
+        free = scope & ~dilate(glare | tool, _RIM) & ~cover
+        visible = (warp_to_rest(free, flow) > 0.99) & scope & ~self.rest_blocked
         return Frame(rgb, flow, visible, free, tool, glare, amplitude, fault)
 
     def _shine(self, picture: Map, amplitude: float) -> tuple[Map, Mask]:
@@ -361,12 +365,12 @@ class Stage:
         if not recipe.tool or (recipe.motion == "press from behind" and not recipe.tool_at_rest):
             return picture, mask.astype(bool)
         shaft = np.array([np.cos(self.angle), np.sin(self.angle)])
-        centre, near = self.field.centre, amplitude > 0.02
+        centre, is_touching = self.field.centre, amplitude > 0.02
         row, column = np.clip(centre[::-1].round().astype(int), 0, size - 1)
-        back = 0.0 if near else (0.12 if recipe.tool_at_rest else 1.2) * size
+        distance = 0.0 if is_touching else (0.12 if recipe.tool_at_rest else 1.2) * size
         if recipe.motion == "press from behind":
-            back = 0.15 * size  # stays in one place next to the contact
-        tip = centre + (flow[row, column] if near else 0) + back * shaft
+            distance = 0.15 * size  # stays in one place next to the contact
+        tip = centre + (flow[row, column] if is_touching else 0) + distance * shaft
         finger = recipe.tool == "gloved finger"
         width = size * (0.22 if finger else recipe.tool_width)
         end = tip + 2 * size * shaft
@@ -441,49 +445,49 @@ def inverse(flow: Map) -> Map:
     """Position x in the rest frame of each pixel y, x + u(x) = y, by fixed-point iteration. (H, W, 2) px."""
     grid = source = pixels(*flow.shape[:2])
     for _ in range(60):
-        before = source
+        previous = source
         source = grid - np.stack([sample(flow[..., c], source, order=1) for c in range(2)], -1)
-        if np.abs(source - before).max() < 1e-3:
+        if np.abs(source - previous).max() < 1e-3:
             break
     return source
 
 
 def inside(flow: Map) -> Mask:
     """Pixels (H, W) of the rest frame that stay in the image under a flow (H, W, 2) px."""
-    at = pixels(*flow.shape[:2]) + flow
-    return np.asarray(np.all((at >= 0) & (at <= np.array(flow.shape[1::-1]) - 1), axis=-1))
+    points = pixels(*flow.shape[:2]) + flow
+    return np.asarray(np.all((points >= 0) & (points <= np.array(flow.shape[1::-1]) - 1), axis=-1))
 
 
-def at_rest(mask: Mask, flow: Map) -> Map:
+def warp_to_rest(mask: Mask, flow: Map) -> Map:
     """A mask (H, W) of the current frame on the rest frame's pixels, 0..1, by a flow (H, W, 2) px."""
-    at = pixels(*mask.shape) + flow
-    return np.asarray(cv2.remap(mask.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR))
+    points = pixels(*mask.shape) + flow
+    return np.asarray(cv2.remap(mask.astype(np.float32), points[..., 0], points[..., 1], cv2.INTER_LINEAR))
 
 
-def dilated(mask: Mask, side: int) -> Mask:
+def dilate(mask: Mask, side: int) -> Mask:
     """A mask (H, W) dilated by a square of `side` px."""
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def sensed(picture: Map, noise: float, rng: np.random.Generator) -> Pixels:
+def add_noise(picture: Map, noise: float, rng: np.random.Generator) -> Pixels:
     """A picture of 0..255 with Gaussian noise of a standard deviation [grey levels]."""
     return np.clip(np.round(picture + rng.normal(0, noise, picture.shape)), 0, 255).astype(np.uint8)
 
 
-def resampled(picture: Map, at: Map) -> Map:
+def resample(picture: Map, points: Map) -> Map:
     """A picture (2H, 2W, 3), two samples a pixel, at places (..., 2) px by cubic splines: (..., 3)."""
-    where = (at + 0.5) * _FINE - 0.5
-    return np.stack([sample(picture[..., c], where) for c in range(3)], -1)
+    coordinates = (points + 0.5) * _FINE - 0.5
+    return np.stack([sample(picture[..., c], coordinates) for c in range(3)], -1)
 
 
-def sample(field: Map, where: Map, order: int = 3) -> Map:
+def sample(field: Map, points: Map, order: int = 3) -> Map:
     """Field (H, W) at points (x, y), (..., 2), by cubic splines.
 
     OpenCV's remap rounds to 1/32 px and its bicubic kernel displaces a ramp by up to 0.05 px: too much for a
     ground truth.
     """
     return np.asarray(
-        map_coordinates(field, (where[..., 1], where[..., 0]), order=order, mode="mirror"), np.float32
+        map_coordinates(field, (points[..., 1], points[..., 0]), order=order, mode="mirror"), np.float32
     )
 
 
@@ -491,5 +495,5 @@ def jpeg(rgb: Pixels, quality: int) -> Pixels:
     """The image after JPEG compression; quality 0: unchanged."""
     if not quality:
         return rgb
-    _, packed = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
+    _, encoded = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])

@@ -26,11 +26,12 @@ def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
         sequences = list(Dataset(root))[:count]
         height, width = sequences[0].size
         flow_s, stereo_s = (
-            sum(one.attrs["timings"][stage]["cpu_s"] for one in sequences) for stage in ("flow", "stereo")
+            sum(sequence.attrs["timings"][stage]["cpu_s"] for sequence in sequences)
+            for stage in ("flow", "stereo")
         )
         rows.append(
             {"data": root.name, "size": f"{width} x {height}", "sequences": len(sequences)}
-            | figures([sample for one in sequences for sample in _samples(one)])
+            | figures([sample for sequence in sequences for sample in _samples(sequence)])
             | {"cost_ratio": float((flow_s + stereo_s) / flow_s)}
         )
     return {"data": result_status.data(*data), "rows": rows}
@@ -38,12 +39,16 @@ def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
 
 def figures(samples: list[Sample]) -> dict[str, float]:
     """Errors in mm, bias as a share, quantiles of |error| / deviation in depth and across the view."""
-    true, found, deviation, pressed = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-    z = np.abs(found - true) / deviation
-    here = pressed & (np.abs(true[:, 2]) > _DEEP_MM)
-    bias = 1 - (true[here, 2] * found[here, 2]).sum() / (true[here, 2] ** 2).sum() if here.any() else np.nan
+    true, recovered, deviation, pressed = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    z = np.abs(recovered - true) / deviation
+    in_contact = pressed & (np.abs(true[:, 2]) > _DEEP_MM)
+    bias = (
+        1 - (true[in_contact, 2] * recovered[in_contact, 2]).sum() / (true[in_contact, 2] ** 2).sum()
+        if in_contact.any()
+        else np.nan
+    )
     return {
-        "depth_rms_mm": _rms(found[:, 2] - true[:, 2]),
+        "depth_rms_mm": _rms(recovered[:, 2] - true[:, 2]),
         "signal_rms_mm": _rms(true[:, 2]),
         "pressed_bias": float(bias),
         "depth_z68": float(np.quantile(z[:, 2], 0.6827)),
@@ -61,12 +66,12 @@ def _samples(sequence: Sequence) -> list[Sample]:
     """Samples of all frames but the rest frame."""
     samples = []
     for t in range(1, sequence.frames):
-        here = sequence["tissue"][:] & ~sequence["tool"][0] & sequence["visible"][t]
+        visible = sequence["tissue"][:] & ~sequence["tool"][0] & sequence["visible"][t]
         load = np.linalg.norm(sequence["traction"][t], axis=-1)
         motion = (sequence[name][t] for name in ("motion", "motion_recovered", "motion_deviation"))
         fields = *motion, load > _CONTACT * max(load.max(), 1e-9)
-        true, found, deviation, pressed = (np.asarray(field)[here][::_EVERY] for field in fields)
-        samples.append((true, found, deviation, pressed))
+        true, recovered, deviation, pressed = (np.asarray(field)[visible][::_EVERY] for field in fields)
+        samples.append((true, recovered, deviation, pressed))
     return samples
 
 
@@ -77,14 +82,14 @@ _TARGETS = (
 )
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Draws `stereo.json`: values relative to their targets, z-scores, every row."""
     shares: dict[str, list[float]] = {}
     scores: dict[str, list[float]] = {}
-    for row in found["rows"]:
-        for key, what, limits in _TARGETS:
+    for row in data["rows"]:
+        for key, label, limits in _TARGETS:
             if row["size"] in limits:
-                shares[f"{what}: {row['data']}"] = [abs(row[key]) / limits[row["size"]]]
+                shares[f"{label}: {row['data']}"] = [abs(row[key]) / limits[row["size"]]]
         for part in ("depth", "across"):
             scores[f"{part}, 68%: {row['data']}"] = [row[f"{part}_z68"]]
             scores[f"{part}, 95%: {row['data']}"] = [row[f"{part}_z95"] / 2]
@@ -92,8 +97,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
     chart = report.interval_charts(("Target reached if at most 1", "measured / target", shares), calibrated)
     met = sum(value <= 1 for (value,) in shares.values())
     words = [f"**{met} of {len(shares)} targets are reached.** *z*: quantiles of |error| / deviation."]
-    sections = [report.Section("", found["rows"])]
-    return report.Page("Stereo: motion in three dimensions", found, words, sections, chart)
+    sections = [report.Section("", data["rows"])]
+    return report.Page("Stereo: motion in three dimensions", data, words, sections, chart)
 
 
 STUDY = Study(

@@ -64,16 +64,16 @@ def measure(
     """
     folders = {cameras: list[Path]() for cameras in FOLDERS}
     for kind, index in product(kinds.split(","), range(count)):
-        both, left = (recordings / FOLDERS[cameras] / f"{kind}-{index}" for cameras in (2, 1))
-        if not both.exists():
-            with checked_file.folder_of(both) as part:
+        stereo, mono = (recordings / FOLDERS[cameras] / f"{kind}-{index}" for cameras in (2, 1))
+        if not stereo.exists():
+            with checked_file.folder_of(stereo) as part:
                 rng = np.random.default_rng([seed, KINDS.index(kind), index])
-                record(part, both.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
-        copy_left(both, left)
-        folders[2].append(both)
-        folders[1].append(left)
-    for cameras, of in folders.items():
-        score_and_pool(of, cameras, results / FOLDERS[cameras])
+                record(part, stereo.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
+        copy_left(stereo, mono)
+        folders[2].append(stereo)
+        folders[1].append(mono)
+    for cameras, paths in folders.items():
+        score_and_pool(paths, cameras, results / FOLDERS[cameras])
 
 
 def record(
@@ -106,29 +106,30 @@ def record(
         folder = Path(scratch)
         surface = Surface.of(np.load(run(pythons[0], folder, "mechanics", specimen)), rng)
         sensor_s, level, away = tool_motion(seconds, rng)
-        at = np.minimum((times * _SENSOR_HZ).astype(int), len(level) - 1)  # the sensor's sample of each frame
-        arrays = _scene(surface, level[at], away[at], times, contacts, rng)
+        # The sensor's sample of each frame.
+        samples = np.minimum((times * _SENSOR_HZ).astype(int), len(level) - 1)
+        arrays = _scene(surface, level[samples], away[samples], times, contacts, rng)
         camera, focal = first_camera(rng)
-        flow = [projected(surface.rest, surface.at(level[k], 0.0), camera, focal) for k in at]
+        flow = [project_flow(surface.rest, surface.at(level[k], 0.0), camera, focal) for k in samples]
         pair = camera, right_camera(camera)
-        drawn = {
+        settings = {
             "size": _SIZE,
             "focal_px": focal,
             "cameras": {prefix: matrix.tolist() for prefix, matrix in zip(_VIDEOS, pair, strict=True)},
             "spp": spp,
             "threads": 1,
-            "tool_mm": 0.6 * min(tool["radius_mm"] for one in contacts for tool in one),
+            "tool_mm": 0.6 * min(tool["radius_mm"] for contact in contacts for tool in contact),
             "lamps_mm": [[70.0, 40.0, 260.0], [-60.0, 20.0, 280.0]],
             "watts": 2.6e5,
         }
-        run(pythons[1], folder, "pictures", drawn, arrays)
+        run(pythons[1], folder, "pictures", settings, arrays)
         noise = np.random.default_rng(rng.integers(2**31))
         for prefix, file in _VIDEOS.items():
-            pictures = (_sensed(folder / f"{prefix}{k:05d}.png", noise) for k in range(len(times)))
+            pictures = (_read_with_noise(folder / f"{prefix}{k:05d}.png", noise) for k in range(len(times)))
             recording_writer.write_video(part / file, pictures, times, crf=18)
-    whole = level @ np.array([np.sum([tool["force_mn"] for tool in one], axis=0) for one in contacts])
-    measured = whole @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    np.savez_compressed(part / TRUTH, flow_px=np.array(flow, np.float16), force_mn=measured[at])
+    force = level @ np.array([np.sum([tool["force_mn"] for tool in contact], axis=0) for contact in contacts])
+    measured = force @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    np.savez_compressed(part / TRUTH, flow_px=np.array(flow, np.float16), force_mn=measured[samples])
     measured = measured + 0.02 * rng.normal(size=(len(sensor_s), 3))
     recording_writer.write_force(part, sensor_s, measured / 1000)
     write_pair(part / "pair.yaml", *pair, focal)
@@ -154,9 +155,9 @@ def run(
     (folder / f"{work}.json").write_text(json.dumps(settings))
     if arrays is not None:
         np.savez(folder / f"{work}.npz", **arrays)
-    done = subprocess.run([python, _WORKER, work, folder], capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
+    process = subprocess.run([python, _WORKER, work, folder], capture_output=True, text=True, check=False)
+    if process.returncode:
+        last = (process.stderr.strip() or process.stdout.strip() or "no message").splitlines()[-1]
         raise UserError(f"{python}: {work}: {last}")
     return folder / f"{work}.npz"
 
@@ -175,10 +176,11 @@ def _contact(young: float, rng: np.random.Generator) -> dict[str, Any]:
     radius = float(rng.uniform(3, 6))
     size = float(rng.uniform(0.06, 0.3)) * young * radius**2
     tilt, turn = np.deg2rad(rng.uniform(0, 55)), rng.uniform(0, 2 * np.pi)
-    way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    direction = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     if rng.random() < 0.7:
-        way[2] *= -1
-    return {"at_mm": rng.uniform(-6, 6, 2).tolist(), "radius_mm": radius, "force_mn": (size * way).tolist()}
+        direction[2] *= -1
+    force = size * direction
+    return {"at_mm": rng.uniform(-6, 6, 2).tolist(), "radius_mm": radius, "force_mn": force.tolist()}
 
 
 def tool_motion(seconds: float, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
@@ -212,28 +214,28 @@ class Surface:
     @staticmethod
     def of(solved: Any, rng: np.random.Generator) -> Surface:
         """Felupe's result interpolated by cubic splines, with a relief of a tenth of a millimetre."""
-        at = solved["at"]
-        side = round(len(at) ** 0.5)
-        x, y = at[:side, 0], at[::side, 1]
+        points = solved["at"]
+        side = round(len(points) ** 0.5)
+        x, y = points[:side, 0], points[::side, 1]
         fine = np.linspace(-_FIELD_MM / 2, _FIELD_MM / 2, _SIDE)
 
-        def finer(values: Floats) -> Floats:
+        def refine(values: Floats) -> Floats:
             parts = [RectBivariateSpline(y, x, values.reshape(side, side, 3)[..., k]) for k in range(3)]
             return np.stack([part(fine, fine) for part in parts], axis=-1)
 
         relief = gaussian_filter(rng.normal(size=(_SIDE, _SIDE)), 9)
         rest = np.stack([*np.meshgrid(fine, fine), 0.12 * relief / relief.std()], axis=-1)
-        moved = np.array([[finer(level) for level in contact] for contact in solved["moved"]])
-        return Surface(rest, moved, finer(solved["pulse"]))
+        displacements = np.array([[refine(level) for level in contact] for contact in solved["moved"]])
+        return Surface(rest, displacements, refine(solved["pulse"]))
 
     def at(self, levels: Floats, pulse: float) -> Floats:
         """Displacement (N, N, 3) mm at shares (contacts,) of the forces and a share of the pulse, by a cubic
         through felupe's load levels."""
-        known = np.linspace(0, 1, self.moved.shape[1] + 1)
+        knots = np.linspace(0, 1, self.moved.shape[1] + 1)
         out = pulse * self.pulse
         for contact, level in zip(self.moved, levels, strict=True):
             if level > 0:
-                out = out + KroghInterpolator(known, [np.zeros_like(contact[0]), *contact])(level)
+                out = out + KroghInterpolator(knots, [np.zeros_like(contact[0]), *contact])(level)
         return np.asarray(out, np.float64)
 
 
@@ -255,18 +257,18 @@ def _scene(
         angle = 2 * np.pi * time * np.array([_HEART_HZ, _BREATH_HZ]) + phase
         return float(np.array([0.7, 0.3]) @ np.sin(angle))
 
-    moved, tips = [], []
+    displacements, tips = [], []
     shafts = _SHAFTS[-len(contacts[0]) :]
-    for time, loads, far in zip(times, level, away, strict=True):
-        now = surface.at(loads, pulse(time) - pulse(0.0))
-        k = int(np.argmin(far))
-        here = np.array([tool["at_mm"] for tool in contacts[k]])
-        column, row = np.rint((here.T / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
-        tips.append(surface.rest[row, column] + now[row, column] + _HOVER_MM * far[k] * shafts)
-        moved.append(now.astype(np.float32))
+    for time, loads, distances in zip(times, level, away, strict=True):
+        displacement = surface.at(loads, pulse(time) - pulse(0.0))
+        k = int(np.argmin(distances))
+        positions = np.array([tool["at_mm"] for tool in contacts[k]])
+        column, row = np.rint((positions.T / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
+        tips.append(surface.rest[row, column] + displacement[row, column] + _HOVER_MM * distances[k] * shafts)
+        displacements.append(displacement.astype(np.float32))
     albedo, bumps = texture(rng)
     tools = {"tips": np.array(tips), "shafts": shafts}
-    return {"rest": surface.rest, "moved": np.array(moved), "albedo": albedo, "bumps": bumps} | tools
+    return {"rest": surface.rest, "moved": np.array(displacements), "albedo": albedo, "bumps": bumps} | tools
 
 
 def texture(rng: np.random.Generator) -> tuple[Map, Map]:
@@ -292,26 +294,26 @@ def texture(rng: np.random.Generator) -> tuple[Map, Map]:
 
 def _grow(cover: Pixels, start: Floats, heading: float, width: float, rng: np.random.Generator) -> None:
     """Draws a winding vessel that becomes thinner and branches."""
-    at = np.array(start, float)
-    while width > 1.0 and (at > -50).all() and (at < _TEXELS + 50).all():
+    tip = np.array(start, float)
+    while width > 1.0 and (tip > -50).all() and (tip < _TEXELS + 50).all():
         heading += rng.normal(0, 0.18)
-        after = at + 14 * np.array([np.cos(heading), np.sin(heading)])
-        ends = [tuple(int(v) for v in point) for point in (at, after)]
+        next_tip = tip + 14 * np.array([np.cos(heading), np.sin(heading)])
+        ends = [tuple(int(v) for v in point) for point in (tip, next_tip)]
         cv2.line(cover, ends[0], ends[1], 255, max(1, round(width)), cv2.LINE_AA)
-        at, width = after, width * 0.992
+        tip, width = next_tip, width * 0.992
         if rng.random() < 0.04:
-            _grow(cover, at, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.1), 0.6 * width, rng)
+            _grow(cover, tip, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.1), 0.6 * width, rng)
 
 
 def first_camera(rng: np.random.Generator) -> tuple[Floats, float]:
     """Blender's matrix of a camera above the centre, tilted up to 12 degrees, and its focal length [px]."""
     tilt, turn = np.deg2rad(rng.uniform(0, 12)), rng.uniform(0, 2 * np.pi)
     back = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
-    matrix = _looking(_DISTANCE_MM * back, np.cross([0.0, 1.0, 0.0], back))
+    matrix = _aim_camera(_DISTANCE_MM * back, np.cross([0.0, 1.0, 0.0], back))
     return matrix, float(_SIZE[0] * _DISTANCE_MM / rng.uniform(31, 36))
 
 
-def projected(rest: Floats, moved: Floats, camera: Floats, focal_px: float) -> Map:
+def project_flow(rest: Floats, displacement: Floats, camera: Floats, focal_px: float) -> Map:
     """Flow (H, W, 2) px, in a camera's image of a surface (N, N, 3) at rest, of its motion (N, N, 3) mm."""
 
     def image(points: Floats) -> Floats:
@@ -321,37 +323,37 @@ def projected(rest: Floats, moved: Floats, camera: Floats, focal_px: float) -> M
 
     start = image(rest)
     pixels = np.stack(np.meshgrid(*map(np.arange, _SIZE)), axis=-1)
-    shift = LinearNDInterpolator(Delaunay(start), image(rest + moved) - start, fill_value=0.0)
+    shift = LinearNDInterpolator(Delaunay(start), image(rest + displacement) - start, fill_value=0.0)
     return np.asarray(shift(pixels), np.float32)
 
 
 def right_camera(camera: Floats) -> Floats:
     """Blender's matrix of a second camera to the right of the first, directed at the same centre."""
-    return _looking(camera[:3, 3] + _BASE_MM * camera[:3, 0], camera[:3, 0])
+    return _aim_camera(camera[:3, 3] + _BASE_MM * camera[:3, 0], camera[:3, 0])
 
 
-def _looking(at: Floats, right: Floats) -> Floats:
+def _aim_camera(position: Floats, right: Floats) -> Floats:
     """Matrix of a camera at a place [mm] directed at the centre, its x axis near the direction `right`."""
-    back = at / np.linalg.norm(at)
+    back = position / np.linalg.norm(position)
     right = right - (right @ back) * back
     right = right / np.linalg.norm(right)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    matrix[:3, 3] = at
+    matrix[:3, 3] = position
     return matrix
 
 
 def write_pair(file: Path, left: Floats, right: Floats, focal_px: float) -> None:
     """Writes the two cameras, matrices of Blender, as OpenCV's `stereoCalibrate` does: K, D, R, T [mm]."""
     # The optical axis is -z in Blender with y up, z in OpenCV with y down.
-    first, second = (np.diag([1.0, -1.0, -1.0]) @ one[:3, :3].T for one in (left, right))
+    first, second = (np.diag([1.0, -1.0, -1.0]) @ camera[:3, :3].T for camera in (left, right))
     K = np.array([[focal_px, 0, _SIZE[0] / 2 - 0.5], [0, focal_px, _SIZE[1] / 2 - 0.5], [0, 0, 1]])
     values = {"K1": K, "D1": np.zeros((1, 5)), "K2": K, "D2": np.zeros((1, 5))}
     values |= {"R": second @ first.T, "T": (second @ (left[:3, 3] - right[:3, 3]))[:, None]}
     recording_writer.write_storage(file, values)
 
 
-def _sensed(picture: Path, rng: np.random.Generator) -> Pixels:
+def _read_with_noise(picture: Path, rng: np.random.Generator) -> Pixels:
     """The image with a sensor's noise."""
     rgb = read_picture(picture)[..., ::-1].astype(np.float32)
     noise = np.sqrt(0.6 + 0.012 * rgb) * rng.normal(size=rgb.shape)

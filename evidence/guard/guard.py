@@ -53,13 +53,13 @@ class Change:
         return f"{self.probe} {size} ({self.array})"
 
 
-def stored() -> Sketches:
+def read_sketches() -> Sketches:
     """The sketches of `docs/results/guard.json`."""
     sketches: Sketches = json.loads(FILE.read_text("utf-8"))["probes"]
     return sketches
 
 
-def stored_versions() -> dict[str, int]:
+def read_versions() -> dict[str, int]:
     """The versions of `docs/results/guard.json`, by their names in `synth.formats`."""
     versions: dict[str, int] = json.loads(FILE.read_text("utf-8"))["versions"]
     return versions
@@ -84,9 +84,9 @@ def run_probes(names: Sequence[str], workers: int = _WORKERS) -> Iterator[tuple[
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, max_tasks_per_child=1) as pool:
-        running = {pool.submit(run_probe, name): name for name in names}
-        for done in as_completed(running):
-            yield running[done], done.result()
+        futures = {pool.submit(run_probe, name): name for name in names}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
 
 
 def compare(
@@ -96,9 +96,9 @@ def compare(
     changes = []
     for name in PROBES:
         if name in before and name in now:
-            each = compare_all(before[name], now[name])
-            array = max(each, key=lambda key: each[key])
-            changes.append(Change(name, each[array], array))
+            by_array = compare_all(before[name], now[name])
+            array = max(by_array, key=lambda key: by_array[key])
+            changes.append(Change(name, by_array[array], array))
     return changes
 
 
@@ -129,26 +129,28 @@ def main(
     for name, sketches in run_probes(names):
         now[name] = sketches
         print(f"{len(now)} of {len(names)}: {name}", file=sys.stderr, flush=True)
-    before = stored() if FILE.is_file() else {}
-    known = stored_versions() if FILE.is_file() else {}
+    before = read_sketches() if FILE.is_file() else {}
+    old_versions = read_versions() if FILE.is_file() else {}
     changes = compare(before, now)
     for change in changes:
         typer.echo(f"{'MOVED' if change.moved else 'equal'}  {change.text()}")
-    unraised = find_unraised(changes, known, versions())
+    unraised = find_unraised(changes, old_versions, versions())
     for line in unraised:
         typer.echo(line)
     if accept and not unraised:
         # Sketches of probes that have not moved stay, so that small changes of many commits add up visibly.
-        moved = {change.probe for change in changes if change.moved}
-        kept = {
-            name: {**now.get(name, {}), **({} if name in moved else before.get(name, {}))} for name in PROBES
+        moved_probes = {change.probe for change in changes if change.moved}
+        merged = {
+            name: {**now.get(name, {}), **({} if name in moved_probes else before.get(name, {}))}
+            for name in PROBES
         }
         # A version counts as stored only once all probes that may vouch for it have run.
-        waiting = {version for name in set(PROBES) - set(now) for version in PROBES[name].versions}
-        raised = {
-            key: known.get(key, value) if key in waiting else value for key, value in versions().items()
+        pending = {version for name in set(PROBES) - set(now) for version in PROBES[name].versions}
+        new_versions = {
+            key: old_versions.get(key, value) if key in pending else value
+            for key, value in versions().items()
         }
-        _write({name: sketches for name, sketches in kept.items() if sketches}, raised)
+        _write({name: sketches for name, sketches in merged.items() if sketches}, new_versions)
         from evidence import result_status  # which compares results with the guard
 
         result_status.write_states()
@@ -156,12 +158,12 @@ def main(
     raise typer.Exit(int(bool(unraised) or any(change.moved for change in changes)))
 
 
-def _write(sketches: Mapping[str, Any], known: Mapping[str, int]) -> None:
+def _write(sketches: Mapping[str, Any], numbering: Mapping[str, int]) -> None:
     lines = []
     for name, arrays in sketches.items():
         rows = ",\n".join(
             f"  {json.dumps(array)}: {json.dumps(numbers)}" for array, numbers in arrays.items()
         )
         lines.append(f" {json.dumps(name)}: {{\n{rows}\n }}")
-    text = f'{{"versions": {json.dumps(dict(known))},\n"probes": {{\n' + ",\n".join(lines) + "\n}}\n"
+    text = f'{{"versions": {json.dumps(dict(numbering))},\n"probes": {{\n' + ",\n".join(lines) + "\n}}\n"
     write_whole(FILE, text, durable=False)

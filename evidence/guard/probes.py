@@ -145,30 +145,30 @@ def probe_truth() -> Arrays:
 
 def probe_flow() -> Arrays:
     """Masks and recovered flow of a stored recording, whose motion is below 2 px, and flow of up to 15 px."""
-    left, blocked, tissue = _stored_pictures("stereo", "frames")
+    left, blocked, tissue = _read_pictures("stereo", "frames")
     track = synth.recover_flow(left, blocked, tissue)
-    far = synth.recover_flow(*_moved_far(left[0]), np.ones_like(tissue))
-    classes = [segment(left[0], picture) for picture in left]
+    large_track = synth.recover_flow(*_pull_picture(left[0]), np.ones_like(tissue))
+    segmentations = [segment(left[0], picture) for picture in left]
     return {
         "flow": track.flow,
         "confidence": track.confidence,
-        "large flow": far.flow,
-        "confidence of large flow": far.confidence,
-        "instrument": np.stack([one.instrument for one in classes]),
-        "highlight": np.stack([one.highlight for one in classes]),
+        "large flow": large_track.flow,
+        "confidence of large flow": large_track.confidence,
+        "instrument": np.stack([segmentation.instrument for segmentation in segmentations]),
+        "highlight": np.stack([segmentation.highlight for segmentation in segmentations]),
     }
 
 
 def probe_stereo() -> Arrays:
     """Motion in three dimensions of a stored recording, given a flow of closed form."""
-    left, blocked, tissue = _stored_pictures("stereo", "frames")
-    right, unseen, _ = _stored_pictures("stereo", "right")
+    left, blocked, tissue = _read_pictures("stereo", "frames")
+    right, unseen, _ = _read_pictures("stereo", "right")
     height, width = tissue.shape
     rig = read_rig(RECORDINGS / "stereo/stereo.yaml", (width, height))
     tracker = stereo_track.StereoTracker(rig, left[:1], right[:1], blocked[0], unseen[0], tissue)
     y, x = np.mgrid[:height, :width] / height
     shape = np.stack([np.sin(3 * x) * np.cos(2 * y), np.cos(2 * x + y)], axis=-1).astype(np.float32)
-    moved = [
+    frames = [
         tracker.step(
             left[t],
             right[t],
@@ -180,8 +180,8 @@ def probe_stereo() -> Arrays:
         for t in range(1, len(left))
     ]
     return {
-        "motion": np.stack([frame.motion for frame in moved]),
-        "deviation": np.stack([frame.deviation for frame in moved]),
+        "motion": np.stack([frame.motion for frame in frames]),
+        "deviation": np.stack([frame.deviation for frame in frames]),
         "disparity": tracker.rest.disparity,
     }
 
@@ -212,7 +212,9 @@ def probe_network() -> Arrays:
         for k, sequence in enumerate(Dataset(Path(folder))):
             clip = read_clip(sequence, Grid(32), ("ideal", "recovered"))
             arrays[f"grid {k}: density"] = clip.density
-            arrays |= {f"grid {k}: {source}": moved for source, moved in clip.displacement.items()}
+            arrays |= {
+                f"grid {k}: {source}": displacement for source, displacement in clip.displacement.items()
+            }
     return arrays
 
 
@@ -274,8 +276,8 @@ def store_recordings() -> None:
         for name, keys in jobs.items():
             job = synth.load_job("tiny", [*keys, "fem.load=[0.1,0.3]"])
             with synth.open_dataset(Path(folder) / name, job) as root:
-                stored = synth.write_scene(synth.simulate(job), root)
-            export_recording(synth.open_sequence(stored), RECORDINGS / name)
+                path = synth.write_scene(synth.simulate(job), root)
+            export_recording(synth.open_sequence(path), RECORDINGS / name)
 
 
 def _load(name: str, *keys: str) -> synth.Job:
@@ -287,7 +289,7 @@ def _scene(keys: Sequence[str]) -> tuple[synth.Scene, list[synth.Frame]]:
     return scene, [scene.frame(t) for t in range(len(scene))]
 
 
-def _stored_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:
+def _read_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:
     """Pictures (T, H, W, 3), instruments (T, H, W) of the left camera and tissue (H, W) of a recording."""
     home = RECORDINGS / name
     files = sorted((home / folder).glob("*.png"))
@@ -298,7 +300,7 @@ def _stored_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:
     return pictures, masks, _read(home / "tissue.png")[..., 0] > 0
 
 
-def _moved_far(rest: Pixels) -> tuple[Pixels, Mask]:
+def _pull_picture(rest: Pixels) -> tuple[Pixels, Mask]:
     """A picture (H, W, 3) pulled by 0 to 15 px under a bar, in four frames, and the bar (4, H, W)."""
     height, width = rest.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
@@ -366,11 +368,11 @@ def _score(name: str, *options: str) -> Arrays:
     from typer.testing import CliRunner
 
     with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
-        done = CliRunner().invoke(
+        result = CliRunner().invoke(
             bench_app, ["score", str(RECORDINGS / name), *options, "-o", f"{folder}/out"]
         )
-        if done.exit_code:
-            raise RuntimeError(f"bench score {name}: {done.output} {done.exception!r}")
+        if result.exit_code:
+            raise RuntimeError(f"bench score {name}: {result.output} {result.exception!r}")
         score = json.loads(Path(folder, "out/score.json").read_text("utf-8"))
     curve = score["curve"]
     arrays: Arrays = {f"force, {method}": force for method, force in curve["predicted_mn"].items()}

@@ -46,13 +46,13 @@ def measure(
 ) -> dict[str, Any]:
     """Errors of networks trained in equal steps, and the time of one frame on one core."""
     shapes = [(PRESETS[name].size, *shape) for name, group in OTHERS.items() for shape in group]
-    known = {} if dataset is None else errors(dataset, cache, seeds)
+    by_shape = {} if dataset is None else errors(dataset, cache, seeds)
     rows = time_networks([*shapes, *HEAVY], repeats)
     return {
         "torch": torch.__version__,
         "data": result_status.data(*filter(None, [dataset])),
-        "trained": {name: PRESETS[name].loss for name in OTHERS if known},
-        "rows": [row | known.get(key(row), {}) for row in rows],
+        "trained": {name: PRESETS[name].loss for name in OTHERS if by_shape},
+        "rows": [row | by_shape.get(key(row), {}) for row in rows],
     }
 
 
@@ -63,25 +63,25 @@ def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, ...], dict
         By grid, width, stem and levels: `map_rmse` [mN/mm²], mean over sequences with its interval, and
         `against`, its difference from the preset's, relative.
     """
-    found = {}
+    by_shape = {}
     for name, group in OTHERS.items():
         preset = PRESETS[name]
         clips = load_clips(dataset, Grid(preset.size), ("ideal",), cache=cache)
-        usual = replace(base_settings(), size=preset.size, loss=preset.loss)
+        common = replace(base_settings(), size=preset.size, loss=preset.loss)
         runs: dict[tuple[int, ...], list[dict[str, Any]]] = {}
         for shape, seed in product(group, range(seeds)):
             width, stem, levels = shape
             dropout = preset.arch.model_dump()["dropout"]
             arch = {"width": width, "stem": stem, "levels": levels, "dropout": dropout}
-            settings = replace(usual, arch=replace(usual.arch, **arch), seed=seed)
+            settings = replace(common, arch=replace(common.arch, **arch), seed=seed)
             title = f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}"
             runs.setdefault(shape, []).append(carry_out(title, settings, clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
-        for network, own in runs.items():
-            rmse = by_sequence(own, "map_rmse")
+        for network, network_runs in runs.items():
+            rmse = by_sequence(network_runs, "map_rmse")
             against = [value / float(base.mean()) for value in difference(base, rmse)]
-            found[(preset.size, *network)] = {"map_rmse": mean_of(rmse), "against": against}
-    return found
+            by_shape[(preset.size, *network)] = {"map_rmse": mean_of(rmse), "against": against}
+    return by_shape
 
 
 def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:
@@ -91,8 +91,12 @@ def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:
 
 def preset_of(row: Mapping[str, Any]) -> str:
     """Names of the monocular presets with a row's network."""
-    monocular = {name: one for name, one in PRESETS.items() if _shape(one.arch) and not one.arch.depth}
-    return ", ".join(name for name, one in monocular.items() if key(row) == (one.size, *_shape(one.arch)))
+    monocular = {
+        name: preset for name, preset in PRESETS.items() if _shape(preset.arch) and not preset.arch.depth
+    }
+    return ", ".join(
+        name for name, preset in monocular.items() if key(row) == (preset.size, *_shape(preset.arch))
+    )
 
 
 def _shape(arch: Shape) -> tuple[int, ...]:
@@ -110,8 +114,8 @@ def time_networks(shapes: Sequence[tuple[int, int, int, int]], repeats: int) -> 
     frames = [_frame(arch, size) for size, arch in archs]
     times: list[list[float]] = [[] for _ in shapes]
     for _ in range(ROUNDS):
-        for shape, frame, own in zip(shapes, frames, times, strict=True):
-            own += _time(frame, -(-(5 if shape in HEAVY else repeats) // ROUNDS))
+        for shape, frame, samples in zip(shapes, frames, times, strict=True):
+            samples += _time(frame, -(-(5 if shape in HEAVY else repeats) // ROUNDS))
     return [
         {
             "size": size,
@@ -119,9 +123,9 @@ def time_networks(shapes: Sequence[tuple[int, int, int, int]], repeats: int) -> 
             "stem": arch.stem,
             "levels": arch.levels,
             "parameters": sum(p.numel() for p in build("d2fnet", arch).parameters()),
-            "ms_p50": float(np.median(own)),
+            "ms_p50": float(np.median(samples)),
         }
-        for (size, arch), own in zip(archs, times, strict=True)
+        for (size, arch), samples in zip(archs, times, strict=True)
     ]
 
 
@@ -144,19 +148,19 @@ def _time(frame: Callable[[], object], repeats: int) -> Iterator[float]:
             yield 1e3 * (time.process_time() - start)
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Pareto fronts, one for each grid, and the table."""
-    rows = found["rows"]
-    drawn = (
-        report.chart(*(partial(_draw, name=name, rows=rows) for name in OTHERS)) if found["trained"] else ""
+    rows = data["rows"]
+    chart = (
+        report.chart(*(partial(_draw, name=name, rows=rows) for name in OTHERS)) if data["trained"] else ""
     )
     table = [
-        {"network": f"w{one['width']} stem{one['stem']} depth{one['levels']} {one['size']}²"}
-        | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6}
-        | {"p50 [ms]": one["ms_p50"]}
-        | {"map RMSE [mN/mm²]": report.mean_cell(one["map_rmse"]) if "map_rmse" in one else None}
-        | {"difference from the preset": report.mean_cell(one["against"]) if "against" in one else None}
-        for one in sorted(rows, key=lambda one: float(one["ms_p50"]))
+        {"network": f"w{row['width']} stem{row['stem']} depth{row['levels']} {row['size']}²"}
+        | {"preset": preset_of(row) or None, "parameters [M]": row["parameters"] / 1e6}
+        | {"p50 [ms]": row["ms_p50"]}
+        | {"map RMSE [mN/mm²]": report.mean_cell(row["map_rmse"]) if "map_rmse" in row else None}
+        | {"difference from the preset": report.mean_cell(row["against"]) if "against" in row else None}
+        for row in sorted(rows, key=lambda row: float(row["ms_p50"]))
     ]
     words = (
         "From displacement to the force map, a frame at a time; CPU time of one thread.",
@@ -166,7 +170,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "on a CPU.",
     )
     sections = [report.Section("", table)]
-    return report.Page("Networks: time and error", found, words, sections, drawn)
+    return report.Page("Networks: time and error", data, words, sections, chart)
 
 
 def _draw(axes: Axes, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -178,7 +182,9 @@ def _draw(axes: Axes, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     ]
     for row in rows:
         axes.vlines(row["ms_p50"], *(100 * end for end in row["against"][1:]), color="#c9ced6", zorder=0)
-    groups = {f"stem of {stem}": own for (stem,), own in sorted(report.grouped(rows, "stem").items())}
+    groups = {
+        f"stem of {stem}": stem_rows for (stem,), stem_rows in sorted(report.group_rows(rows, "stem").items())
+    }
     report.scatter(axes, groups, "ms_p50", "difference", "w{width} depth{levels} {default}")
     axes.set(title=f"Networks on {PRESETS[name].size}² and the preset {name}")
     axes.set(xlabel="median time a frame [ms]", ylabel="map RMSE, difference from the preset's [%]")

@@ -35,7 +35,7 @@ def measure(dataset: Path, cache: Path = Path("runs/published"), epochs: int = 2
     base = preset("paper", size=64, epochs=epochs, learning_rate=1e-3)
     base = replace(base, arch=replace(base.arch, width=16, stem=2, levels=3))
     clips = load_clips(dataset, base.grid, ("ideal",), cache=cache)
-    splits = [training.nested(clips, _FOLDS, fold, 0) for fold in range(_FOLDS)]
+    splits = [training.split_nested(clips, _FOLDS, fold, 0) for fold in range(_FOLDS)]
     runs = {
         loss: [
             _run(f"{loss}-{k}", clips, split, replace(base, loss=loss), cache)
@@ -64,40 +64,40 @@ def _run(name: str, clips: Sequence[Clip], split: Split, settings: Any, cache: P
         predictor = training.fit(name, clips, split, settings, cache / "models")
         scores = evaluate(predictor, [clips[i] for i in split.test], "ideal")
         return {
-            "true": [one.true_mn.tolist() for one in scores.clips],
-            "predicted": [one.predicted_mn.tolist() for one in scores.clips],
+            "true": [clip.true_mn.tolist() for clip in scores.clips],
+            "predicted": [clip.predicted_mn.tolist() for clip in scores.clips],
             "map_r2": [row["map_r2"] for row in scores.per_clip()],
             "area": [row["false_positive_relative"] for row in scores.per_clip()],
         }
 
     key = result_cache.key(settings.model_dump(), [clip.content_hash for clip in clips])
-    found: Fold = result_cache.result(cache / "runs", name, key, compute)
-    return found
+    result: Fold = result_cache.result(cache / "runs", name, key, compute)
+    return result
 
 
 def _scale_flow(clips: Sequence[Clip], split: Split) -> Fold:
     """As `_run`: E times the mean displacement over tissue, times the gain of the fitted sequences."""
 
-    def moved(clip: Clip) -> Floats:
+    def measure_motion(clip: Clip) -> Floats:
         size = np.linalg.norm(np.asarray(clip.displacement["ideal"], np.float64), axis=1)
         return np.asarray(clip.young_kpa * size.sum((1, 2)) / clip.mask.sum())
 
     x, y = (
-        np.concatenate([part(clips[i]) for i in split.fit])
-        for part in (moved, lambda clip: np.linalg.norm(clip.force, axis=1))
+        np.concatenate([quantity(clips[i]) for i in split.fit])
+        for quantity in (measure_motion, lambda clip: np.linalg.norm(clip.force, axis=1))
     )
     gain = float(x @ y / (x @ x))
-    tested = [clips[i] for i in split.test]
-    true = [np.linalg.norm(clip.force, axis=1).tolist() for clip in tested]
+    test_clips = [clips[i] for i in split.test]
+    true = [np.linalg.norm(clip.force, axis=1).tolist() for clip in test_clips]
     return {
         "true": true,
-        "predicted": [(gain * moved(clip)).tolist() for clip in tested],
+        "predicted": [(gain * measure_motion(clip)).tolist() for clip in test_clips],
         "map_r2": [],
         "area": [],
     }
 
 
-def _row(name: str, folds: Sequence[Fold], usual: Sequence[Fold]) -> dict[str, Any]:
+def _row(name: str, folds: Sequence[Fold], base: Sequence[Fold]) -> dict[str, Any]:
     """Pooled scores of the total force, their spread over the folds, and what is predicted without force."""
     scores = []
     for fold in folds:
@@ -113,20 +113,20 @@ def _row(name: str, folds: Sequence[Fold], usual: Sequence[Fold]) -> dict[str, A
                 "low frames called more": float((predicted[low] > _LOW_MN).mean()),
             }
         )
-    found: dict[str, Any] = {"loss": name, "folds": scores}
+    cells: dict[str, Any] = {"loss": name, "folds": scores}
     for key in ("map_r2", "area"):
-        own, other = (np.concatenate([fold[key] for fold in runs]) for runs in (folds, usual))
-        if own.size:
-            found[key] = mean_of(own)
-            found[f"{key}_less_mse"] = None if folds is usual else difference(other, own)
-    return found
+        values, base_values = (np.concatenate([fold[key] for fold in runs]) for runs in (folds, base))
+        if values.size:
+            cells[key] = mean_of(values)
+            cells[f"{key}_less_mse"] = None if folds is base else difference(base_values, values)
+    return cells
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Scores beside the published ones."""
     rows = [
         {"loss": row["loss"]} | {key: _cell([fold[key] for fold in row["folds"]]) for key in row["folds"][0]}
-        for row in found["rows"]
+        for row in data["rows"]
     ]
     rows.append({"loss": "Heraoui et al.", **PUBLISHED, "low frames called more": "–"})
     maps = [
@@ -136,19 +136,19 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "false-positive area": report.mean_cell(row["area"]),
             "less that of mse": report.mean_cell(row["area_less_mse"]) if row["area_less_mse"] else "–",
         }
-        for row in found["rows"]
+        for row in data["rows"]
         if "area" in row
     ]
-    by_name = {row["loss"]: row for row in found["rows"] if "area" in row}
+    by_name = {row["loss"]: row for row in data["rows"] if "area" in row}
     change = {name: row["area"][0] / by_name["mse"]["area"][0] - 1 for name, row in by_name.items()}
     low = {
         row["loss"]: np.mean([fold["low frames called more"] for fold in row["folds"]])
-        for row in found["rows"]
+        for row in data["rows"]
     }
-    below = report.percent([found["below_300_mn"]])
+    below = report.percent([data["below_300_mn"]])
     words = (
-        f"{found['sequences']} sequences, {found['frames']} frames of the job `paper`: mean force "
-        f"{found['mean_mn']:.3g} mN, largest {found['largest_mn']:.3g} mN, {below} of the frames in contact "
+        f"{data['sequences']} sequences, {data['frames']} frames of the job `paper`: mean force "
+        f"{data['mean_mn']:.3g} mN, largest {data['largest_mn']:.3g} mN, {below} of the frames in contact "
         "below 300 mN. Three folds that share no sequence: their mean, least and largest.",
         "Heraoui et al. report a false-positive area that their loss reduces from 31.2 to 8.4%, by 73%. Here "
         f"it changes the area by {change['antighost-frame']:+.0%}, a threshold of each cell by "
@@ -164,7 +164,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         report.Section("Total force", rows),
         report.Section("Force map, means over sequences, BCa intervals", maps),
     ]
-    return report.Page("The published table, anew", found, words, sections)
+    return report.Page("The published table, anew", data, words, sections)
 
 
 def _cell(values: Sequence[float]) -> str:

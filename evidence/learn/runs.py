@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from evidence import report, result_status, training
-from evidence import result_cache as stored
+from evidence import report, result_cache, result_status, training
 from evidence.paired_means import difference, mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
@@ -49,49 +48,49 @@ def measure(
         runs.setdefault(loss, []).append(carry_out(f"{loss}-seed{seed}", settings, clips, cache))
     return {
         "data": result_status.data(dataset),
-        "rows": [row(name, own, runs["mse"]) for name, own in runs.items()],
+        "rows": [row(name, loss_runs, runs["mse"]) for name, loss_runs in runs.items()],
     }
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Means over sequences, and differences from squared error."""
     table = [
-        {"loss": one["loss"], "runs": one["runs"], "pooled map R²": one["map_r2_pooled"]}
-        | {METRICS[key].column: report.mean_cell(one[key]) for key in SCORES}
-        for one in found["rows"]
+        {"loss": result["loss"], "runs": result["runs"], "pooled map R²": result["map_r2_pooled"]}
+        | {METRICS[key].column: report.mean_cell(result[key]) for key in SCORES}
+        for result in data["rows"]
     ]
-    less = [
-        {"loss": one["loss"]}
-        | {METRICS[key].column: report.mean_cell(one["against_mse"][key]) for key in SCORES}
-        for one in found["rows"]
-        if one["against_mse"]
+    differences = [
+        {"loss": result["loss"]}
+        | {METRICS[key].column: report.mean_cell(result["against_mse"][key]) for key in SCORES}
+        for result in data["rows"]
+        if result["against_mse"]
     ]
     sections = [
         report.Section("Means over tested sequences, BCa intervals", table),
-        report.Section("Difference from squared error, paired by sequences", less),
+        report.Section("Difference from squared error, paired by sequences", differences),
     ]
     words = ("Networks of width 16 on a 64² grid, ideal flow, in equal steps on the same batches.",)
-    return report.Page("Losses", found, words, sections)
+    return report.Page("Losses", data, words, sections)
 
 
 def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means of a loss's runs over tested sequences, and their differences from those of another loss."""
     pooled = float(np.mean([run["map_r2_pooled"] for run in runs]))
-    found: dict[str, Any] = {"loss": name, "runs": len(runs), "map_r2_pooled": pooled, "against_mse": {}}
+    cells: dict[str, Any] = {"loss": name, "runs": len(runs), "map_r2_pooled": pooled, "against_mse": {}}
     for key in SCORES:
-        own, other = by_sequence(runs, key), by_sequence(base, key)
-        found[key] = mean_of(own)
+        values, base_values = by_sequence(runs, key), by_sequence(base, key)
+        cells[key] = mean_of(values)
         if runs is not base:
-            found["against_mse"][key] = difference(other, own)
-    return found
+            cells["against_mse"][key] = difference(base_values, values)
+    return cells
 
 
 def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> Floats:
     """A score of every tested sequence, sorted by name; means over the runs that tested it."""
     values: dict[str, list[float]] = {}
     for run in runs:
-        for one in run["sequences"]:
-            values.setdefault(one["name"], []).append(one.get(key, np.nan))
+        for sequence in run["sequences"]:
+            values.setdefault(sequence["name"], []).append(sequence.get(key, np.nan))
     return np.array([np.mean(values[name]) for name in sorted(values)], np.float64)
 
 
@@ -100,21 +99,23 @@ def carry_out(name: str, settings: TrainingSettings, clips: Sequence[Clip], cach
 
     From `cache` if it has those of the same settings and data; an interrupted training continues.
     """
-    split = training.nested(clips, 3, 0, 0)
+    split = training.split_nested(clips, 3, 0, 0)
 
     def compute() -> dict[str, Any]:
-        began = time.process_time()
+        start = time.process_time()
         predictor = training.fit(name, clips, split, settings, cache / "models")
-        spent = time.process_time() - began
+        cpu_s = time.process_time() - start
         scores = evaluate(predictor, [clips[i] for i in split.test], "ideal")
-        typer.echo(f"{name}: {spent:.0f} CPU-s", err=True)
+        typer.echo(f"{name}: {cpu_s:.0f} CPU-s", err=True)
         pooled = scores.summary()["map_r2_pooled"]
-        rows = [{"name": c.name} | one for c, one in zip(scores.clips, scores.per_clip(), strict=True)]
-        return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": spent}
+        rows = [
+            {"name": clip.name} | line for clip, line in zip(scores.clips, scores.per_clip(), strict=True)
+        ]
+        return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": cpu_s}
 
-    key = stored.key(settings.model_dump(), [clip.content_hash for clip in clips])
-    done: dict[str, Any] = stored.result(cache / "runs", name, key, compute)
-    return done
+    key = result_cache.key(settings.model_dump(), [clip.content_hash for clip in clips])
+    result: dict[str, Any] = result_cache.result(cache / "runs", name, key, compute)
+    return result
 
 
 STUDY = Study(

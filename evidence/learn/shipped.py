@@ -14,7 +14,7 @@ from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
 from learn.inference import shipped_networks
 from learn.inference.predict import Predictor, load_model
-from learn.split import keep_unseen as held_out
+from learn.split import keep_unseen
 from synth.errors import UserError
 
 _LEVEL = 0.9
@@ -37,8 +37,8 @@ def measure(
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:
     """Errors and coverage of a model on the held-out sequences of a dataset."""
     source = scored_source(predictor.card.settings.input)
-    every = load_clips(root, predictor.grid, (source,), cache=cache)
-    clips = held_out(every, predictor.card)
+    candidates = load_clips(root, predictor.grid, (source,), cache=cache)
+    clips = keep_unseen(candidates, predictor.card)
     if not clips:
         raise UserError(f"{root}: no sequence was held out from the model's training")
     bare = [clip.membrane != "intact" for clip in clips]
@@ -48,60 +48,60 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     row["membrane_known"] = None
     if predictor.card.settings.arch.membrane:
         row["membrane_known"] = figures(partial(estimate, membrane_known=True), clips, bare)["whole"]
-    known = evaluate(predictor, clips, source).summary()
-    row["map_r2"] = round(known["map_r2_pooled"], 4)
-    row["false_positives"] = round(known["false_positive_relative"], 5)
-    covered = next(one for one in cover(predictor, clips, source) if one.level == _LEVEL).as_dict()
+    summary = evaluate(predictor, clips, source).summary()
+    row["map_r2"] = round(summary["map_r2_pooled"], 4)
+    row["false_positives"] = round(summary["false_positive_relative"], 5)
+    coverage = next(entry for entry in cover(predictor, clips, source) if entry.level == _LEVEL).as_dict()
     for part in ("size", "x", "y", "z"):
-        row[f"covered_{part}"] = [covered[part][end] for end in ("mean", "low", "high")]
-    return row | {key: covered[key] for key in _WIDTHS}
+        row[f"covered_{part}"] = [coverage[part][end] for end in ("mean", "low", "high")]
+    return row | {key: coverage[key] for key in _WIDTHS}
 
 
-def listed(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def list_figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Figures for a model's card, by dataset."""
     lines = {}
-    for row in own:
+    for row in rows:
         errors = [f"{words} {report.percent(row[key])}" for words, key in _LISTED.items() if row[key]]
         coverage = f"coverage of 90% intervals {report.percent(row['covered_size'])}"
         lines[f"{row['data']}, {row['sequences']} held-out sequences"] = "; ".join([*errors, coverage])
     return lines
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Errors and coverage, for every model and dataset."""
     errors = [
         {"model": row["model"], "data": row["data"], "sequences": row["sequences"]}
         | {name: report.percent(row.get(key)) for name, key in _ERRORS.items()}
         | {"map R²": row["map_r2"], "false positives": row["false_positives"]}
         | {"gain": row["gain"], "slope": row["slope"]}
-        for row in found["rows"]
+        for row in data["rows"]
     ]
-    covered = [
+    coverage = [
         {"model": row["model"], "data": row["data"]}
         | {part: report.percent(row[f"covered_{part}"]) for part in ("size", "x", "y", "z")}
         | {"width, of the peak": f"{row['width_of_peak']:.0%}"}
         | {"widths of x, y, z [mN]": ", ".join(f"{row[f'width_{axis}_mn']:.1f}" for axis in "xyz")}
         | {"frames out of distribution": f"{row['out_of_distribution']:.0%}"}
-        for row in found["rows"]
+        for row in data["rows"]
     ]
     sections = [
         report.Section("Errors", errors, (_ERRORS_ARE,)),
-        report.Section("Coverage of 90% intervals", covered, (_COVERED_IS,)),
+        report.Section("Coverage of 90% intervals", coverage, (_COVERED_IS,)),
     ]
     worst = ", ".join(
-        f"{report.percent(row['whole'])} with {row['model']} on {row['data']}" for row in found["rows"]
+        f"{report.percent(row['whole'])} with {row['model']} on {row['data']}" for row in data["rows"]
     )
     words = (f"**Error of the force: {worst}.** All sequences are held out from training and calibration.",)
     parts = [
-        (title, "share", {f"{row['model']}: {row['data']}": row[key] for row in found["rows"]})
+        (title, "share", {f"{row['model']}: {row['data']}": row[key] for row in data["rows"]})
         for title, key in _CHARTS
     ]
-    return report.Page("The pretrained networks", found, words, sections, report.interval_charts(*parts))
+    return report.Page("The pretrained networks", data, words, sections, report.interval_charts(*parts))
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Coverage of 90% intervals", "covered_size"))
 _WIDTHS = (
-    *(f"width_{one}" for one in ("mn", "of_peak", "x_mn", "y_mn", "z_mn")),
+    *(f"width_{suffix}" for suffix in ("mn", "of_peak", "x_mn", "y_mn", "z_mn")),
     "out_of_distribution",
     "distance",
 )

@@ -36,86 +36,86 @@ def measure(
     default of that size; `frames`: over which the time of a whole frame is measured.
     """
     rows: list[dict[str, Any]] = []
-    for wide in (int(part) for part in width.split(",")):
-        sections: dict[str, Any] = {"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}
-        ours = case(Job.model_validate(sections), 0)
+    for width_px in (int(part) for part in width.split(",")):
+        sections: dict[str, Any] = {"seed": seed, "render": {"size": (width_px, width_px * 3 // 4)}}
+        setup = case(Job.model_validate(sections), 0)
         settings = list(product((int(part) for part in spp.split(",")), _INTEGRATORS[:1]))
         settings += [(_DEFAULT[0], kind) for kind in _INTEGRATORS[1:]]
         for paths, kind in settings:
-            row = {"spp": paths, "integrator": kind, "width": wide}
-            row["default"] = (paths, kind, wide) == _DEFAULT
-            rows.append(row | {"vertices": len(ours.vertices)} | measure_setting(ours, paths, kind))
+            row = {"spp": paths, "integrator": kind, "width": width_px}
+            row["default"] = (paths, kind, width_px) == _DEFAULT
+            rows.append(row | {"vertices": len(setup.vertices)} | measure_setting(setup, paths, kind))
         for count in (int(part) for part in vertices.split(",")):
-            other = case(Job.model_validate(sections | {"anatomy": {"vertices": count}}), 0)
-            row = dict(zip(("spp", "integrator", "width"), (*_DEFAULT[:2], wide), strict=True))
-            row |= {"default": False, "vertices": len(other.vertices)}
-            rows.append(row | measure_setting(other, *_DEFAULT[:2]))
+            other_setup = case(Job.model_validate(sections | {"anatomy": {"vertices": count}}), 0)
+            row = dict(zip(("spp", "integrator", "width"), (*_DEFAULT[:2], width_px), strict=True))
+            row |= {"default": False, "vertices": len(other_setup.vertices)}
+            rows.append(row | measure_setting(other_setup, *_DEFAULT[:2]))
     cost = frame_cost(case(Job(seed=seed), 0), frames)
     return {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
 
 
-def measure_setting(ours: Case, spp: int, kind: str) -> dict[str, float]:
+def measure_setting(setup: Case, spp: int, kind: str) -> dict[str, float]:
     """CPU seconds an image, its noise, and the error of DIS flow for a pull of 1.5 mm.
 
     Noise is measured on two images of the tissue (`noises`), flow error over visible tissue away from the
     instrument.
     """
-    renderer = ours.renderer
-    stage = renderer.stage(ours.state(), spp=spp, integrator=kind)
+    renderer = setup.renderer
+    stage = renderer.stage(setup.state(), spp=spp, integrator=kind)
     stage.render(0)
-    spent, pictures = [], []
+    times_s, pictures = [], []
     for seed, lift in ((1, 0.0), (2, 0.0), (3, _LIFT)):
         start = time.process_time()
-        renderer.move(stage, ours.state(lift))
+        renderer.move(stage, setup.state(lift))
         pictures.append(stage.render(seed))
-        spent.append(time.process_time() - start)
-    one, two, three = pictures
-    tissue = renderer.rest.tissue & ~renderer.render(ours.state(), 0).tool
-    truth = renderer.render(ours.state(_LIFT), 4)
-    rest, now = (renderer.develop(picture, 9 + k) for k, picture in enumerate((one, three)))
-    every, inside = np.ones_like(tissue), tissue & truth.visible
-    flow, _ = Dis().flow(rest, now, every, every)
+        times_s.append(time.process_time() - start)
+    first, second, lifted = pictures
+    tissue = renderer.rest.tissue & ~renderer.render(setup.state(), 0).tool
+    truth = renderer.render(setup.state(_LIFT), 4)
+    rest, now = (renderer.develop(picture, 9 + k) for k, picture in enumerate((first, lifted)))
+    usable, inside = np.ones_like(tissue), tissue & truth.visible
+    flow, _ = Dis().flow(rest, now, usable, usable)
     error = np.linalg.norm(flow - truth.flow, axis=-1)[inside]
     return {
-        "cpu_s": float(np.median(spent)),
-        **noises(one, two, tissue),
+        "cpu_s": float(np.median(times_s)),
+        **noises(first, second, tissue),
         "flow_median_px": float(np.median(error)),
         "flow_p95_px": float(np.quantile(error, 0.95)),
     }
 
 
-def noises(one: Map, two: Map, inside: Mask, white: float = 1.0) -> dict[str, float]:
+def noises(first: Map, second: Map, inside: Mask, white: float = 1.0) -> dict[str, float]:
     """Root mean square noise of an image over a mask, relative to the mean: of its radiance, where reflected
     lamps dominate, and after clipping at the radiance of a white surface, as in a camera."""
-    kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, white), np.minimum(two, white))}
+    kinds = {"noise": (first, second), "noise_clipped": (np.minimum(first, white), np.minimum(second, white))}
     return {
         kind: float(np.sqrt(((a - b)[inside] ** 2).mean() / 2) / a[inside].mean())
         for kind, (a, b) in kinds.items()
     }
 
 
-def frame_cost(ours: Case, frames: int) -> dict[str, float]:
+def frame_cost(setup: Case, frames: int) -> dict[str, float]:
     """CPU-seconds of a frame: update, image, sensor and ground truth; the first one is warm-up."""
-    spent = []
+    times_s = []
     for k in range(frames + 1):
         start = time.process_time()
-        ours.renderer.render(ours.state(0.1 * k), k)
-        spent.append(time.process_time() - start)
-    low, middle, high = np.quantile(spent[1:], (0, 0.5, 1)).tolist()
+        setup.renderer.render(setup.state(0.1 * k), k)
+        times_s.append(time.process_time() - start)
+    low, middle, high = np.quantile(times_s[1:], (0, 0.5, 1)).tolist()
     return {"cpu_s_least": low, "cpu_s_median": middle, "cpu_s_most": high}
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """Flow error and noise against time."""
     groups = {
-        f"{kind}, {width} px, {vertices} vertices": own
-        for (width, kind, vertices), own in report.grouped(
-            found["rows"], "width", "integrator", "vertices"
+        f"{kind}, {width} px, {vertices} vertices": group
+        for (width, kind, vertices), group in report.group_rows(
+            data["rows"], "width", "integrator", "vertices"
         ).items()
     }
 
-    def draw(axes: Axes, key: str, what: str) -> None:
-        axes.set(xlabel="CPU s a picture", ylabel=what, xscale="log", yscale="log")
+    def draw(axes: Axes, key: str, label: str) -> None:
+        axes.set(xlabel="CPU s a picture", ylabel=label, xscale="log", yscale="log")
         report.scatter(axes, groups, "cpu_s", key, "{spp} spp")
         report.set_log(axes)
         report.legend(axes)
@@ -124,9 +124,9 @@ def page(found: Mapping[str, Any]) -> report.Page:
         lambda axes: draw(axes, "flow_median_px", "flow error, median [px]"),
         lambda axes: draw(axes, "noise_clipped", "noise / mean, clipped"),
     )
-    tables = [report.Section("All settings", found["rows"])]
-    tables += [report.Section("A whole frame", [found["frame"]])]
-    return report.Page("Rendering: flow error and noise against time", found, (), tables, chart)
+    tables = [report.Section("All settings", data["rows"])]
+    tables += [report.Section("A whole frame", [data["frame"]])]
+    return report.Page("Rendering: flow error and noise against time", data, (), tables, chart)
 
 
 STUDY = Study(

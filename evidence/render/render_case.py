@@ -9,7 +9,7 @@ from synth.arrays import Floats
 from synth.job.schema import Job
 from synth.render.scene import Renderer, SceneState
 from synth.sequence.rest_scene import at_rest
-from synth.tune.search import changed
+from synth.tune.search import change_job
 
 
 @dataclass(frozen=True)
@@ -22,24 +22,24 @@ class Case:
     shafts: Floats  # (2, 3)
     centre: Floats  # (2,) mm: where the tissue is held
 
-    def moved(self, lift_mm: float) -> Floats:
+    def move_surface(self, lift_mm: float) -> Floats:
         """The surface pulled up by a Gaussian of 3 mm width, and laterally by a third of that."""
         r2 = ((self.vertices[:, :2] - self.centre) ** 2).sum(axis=1)
         pull = lift_mm * np.exp(-r2 / 18.0)
         return np.asarray(self.vertices + pull[:, None] * np.array([0.3, 0.15, 1.0]))
 
-    def held(self, lift_mm: float) -> Floats:
+    def move_tips(self, lift_mm: float) -> Floats:
         """The tips, which move with the tissue."""
         return self.tips + lift_mm * np.array([0.3, 0.15, 1.0])
 
     def state(self, lift_mm: float = 0.0) -> SceneState:
         """Surface and instrument, pulled up by `lift_mm`."""
-        return SceneState(self.moved(lift_mm), self.held(lift_mm), self.shafts)
+        return SceneState(self.move_surface(lift_mm), self.move_tips(lift_mm), self.shafts)
 
 
 def case(job: Job, index: int) -> Case:
     """Sequence `index` of a job with a plain pull as its load."""
-    scene = at_rest(changed(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
+    scene = at_rest(change_job(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
     surface = replace(scene.surface, uv=scene.surface.uv.copy())  # `stability` modifies it
     scene = replace(scene, surface=surface)
     rng = np.random.default_rng([job.seed, index])

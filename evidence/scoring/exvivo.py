@@ -33,7 +33,7 @@ from synth.sequence.draw import read_scheme
 from synth.sequence.rest_scene import at_rest
 from synth.system import checked_file
 from synth.system.terminal import counting
-from synth.tune.search import changed
+from synth.tune.search import change_job
 
 _GESTURES = 3
 _LEVELS = 9
@@ -68,14 +68,14 @@ def measure(
         cameras: [recordings / name / f"{index:03d}" for index in range(count)]
         for cameras, name in FOLDERS.items()
     }
-    for index, (left, both) in enumerate(zip(folders[1], folders[2], strict=True)):
-        if not both.exists():
+    for index, (mono, stereo) in enumerate(zip(folders[1], folders[2], strict=True)):
+        if not stereo.exists():
             count_frames = counting(f"recording {index}", int(seconds * fps))
-            with count_frames as progress, checked_file.folder_of(both) as part:
+            with count_frames as progress, checked_file.folder_of(stereo) as part:
                 make(plan, index, part, progress)
-        copy_left(both, left)
-    for cameras, of in folders.items():
-        score_and_pool(of, cameras, results / FOLDERS[cameras])
+        copy_left(stereo, mono)
+    for cameras, paths in folders.items():
+        score_and_pool(paths, cameras, results / FOLDERS[cameras])
 
 
 @dataclass(frozen=True)
@@ -136,12 +136,12 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
     (part / "masks").mkdir(parents=True)
     job = job_of(plan)
-    scene = at_rest(changed(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
+    scene = at_rest(change_job(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
     case, surface = scene.scenario, scene.surface
     rng = np.random.default_rng([plan.seed, index, 77])
     opening, young = job.anatomy.craniotomy.radius_mm, case.tissue.young_kpa
     gestures = [scenario.draw_gesture(job.fem, opening, young, rng) for _ in range(_GESTURES)]
-    motions = [_moved(job, case, gesture, surface) for gesture in gestures]
+    motions = [_deform(job, case, gesture, surface) for gesture in gestures]
     course = _course(plan, rng)
     steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
     times = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
@@ -149,9 +149,9 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
     assert renderer.right is not None
     pictures: list[tuple[Pixels, Pixels]] = []
     for k, time in enumerate(times):
-        at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
-        motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
-        vertices, tips, shafts = _pose(scene.shape, motion, gesture, course, at, rng)
+        sample = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
+        motion, gesture = motions[course.gesture[sample]], gestures[course.gesture[sample]]
+        vertices, tips, shafts = _pose(scene.shape, motion, gesture, course, sample, rng)
         shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
         assert shot.rgb_right is not None
         pictures.append((shot.rgb, shot.rgb_right))
@@ -166,7 +166,7 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
     # Contact-free spans at both ends on the sensor's clock, as noted by an operator.
     free_s = np.array([[0.1, _STILL_S - 0.1], [plan.seconds - 0.2, plan.seconds + 0.8]]) - lag
-    about: dict[str, object] = {
+    meta: dict[str, object] = {
         "scale_mm_per_px": float(scene.scale_mm_per_px * (1 + 0.02 * rng.normal())),
         "scale_uncertainty": 0.02,
         "young_kpa": case.tissue.young_kpa,
@@ -176,10 +176,10 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": free_s.tolist()},
         "stereo": {"calibration": _PAIR},
     }
-    recording_writer.write_meta(part, about)
+    recording_writer.write_meta(part, meta)
 
 
-def _moved(
+def _deform(
     job: jobs.Job, case: scenario.Scenario, gesture: tool_gesture.Gesture, surface: CortexSurface
 ) -> Deformation:
     """Deformation from no load to full load, by a gesture that only rises."""
@@ -209,10 +209,10 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
         turn += 1
     tremor = 0.03 * np.sin(2 * np.pi * rng.uniform(8, 11) * time + rng.uniform(0, 6)) * level
     level = np.clip(level + tremor, 0, 1)
-    return _Course(time, level, _crept(time, level), gesture, away)
+    return _Course(time, level, _apply_creep(time, level), gesture, away)
 
 
-def _crept(time_s: Floats, level: Floats) -> Floats:
+def _apply_creep(time_s: Floats, level: Floats) -> Floats:
     """Quasi-linear creep with one time constant (Fung): part of the response has a first-order lag."""
     share = (time_s[1] - time_s[0]) / _LATE_S
     late = lfilter([share], [1, share - 1], level)
@@ -224,22 +224,22 @@ def _pose(
     motion: Deformation,
     gesture: tool_gesture.Gesture,
     course: _Course,
-    at: int,
+    index: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats, Floats]:
     """Surface, tips and shafts, interpolated between two levels of the path, with a tremor of 0.1 mm."""
     levels = np.linalg.norm(motion.force, axis=1) / gesture.force_mn
-    strain = float(course.strain[at])
+    strain = float(course.strain[index])
     above = int(np.searchsorted(levels, strain).clip(1, len(levels) - 1))
     width = max(levels[above] - levels[above - 1], 1e-9)
     part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
-    moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
-    places = tool_gesture.anchors(gesture, tool_gesture.trajectory(gesture, 2), rest)
-    corners, weights = (of[0] for of in places)
-    touched = np.einsum("kc,kcd->kd", weights, (rest.vertices + moved)[corners])
+    displacement = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
+    places = tool_gesture.find_anchors(gesture, tool_gesture.trajectory(gesture, 2), rest)
+    corners, weights = (array[0] for array in places)
+    contact_points = np.einsum("kc,kcd->kd", weights, (rest.vertices + displacement)[corners])
     shafts = motion.shaft[-1]
-    tips = touched + gesture.hover_mm * course.away[at] * shafts + 0.1 * rng.normal(size=(1, 3))
-    return rest.vertices + moved, tips, shafts
+    tips = contact_points + gesture.hover_mm * course.away[index] * shafts + 0.1 * rng.normal(size=(1, 3))
+    return rest.vertices + displacement, tips, shafts
 
 
 def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Generator) -> float:

@@ -21,8 +21,7 @@ import numpy as np
 from bench.recording import recording_writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
-from evidence import report
-from evidence import result_cache as stored
+from evidence import report, result_cache
 from evidence.scoring.degradations import FPS, FRAMES, MONOCULAR, STEREO, Change, read_meta, read_table
 from evidence.study import Study
 from synth.dataset.store import Dataset
@@ -51,23 +50,23 @@ _HOLDS = 0.8  # least share of the frames in which a right interval of 90% holds
 def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_TISSUE)) -> dict[str, Any]:
     """Scores rendered recordings after each change; `only`: a pattern of the changes' names."""
     points, clean = list[dict[str, Any]](), list[dict[str, Any]]()
-    for kind, cameras, given in product(kinds.split(","), (2, 1), range(len(_GIVEN))):
-        case = {"kind": kind, "cameras": cameras, "given": given}
-        folders = _rendered(work, kind, seed)
-        usual = [_scored(folder, None, case, work, seed, "") for folder in folders]
-        clean.append(case | _means(usual))
+    for kind, cameras, level in product(kinds.split(","), (2, 1), range(len(_GIVEN))):
+        case = {"kind": kind, "cameras": cameras, "given": level}
+        folders = _render(work, kind, seed)
+        undegraded = [_score(folder, None, case, work, seed, "") for folder in folders]
+        clean.append(case | _means(undegraded))
         for number, (name, (change, cause)) in enumerate((MONOCULAR | STEREO).items()):
-            turn = list(_TISSUE)[(number + given // 2 + cameras) % len(_TISSUE)]
-            known = (given, cameras) in _CASES and (cameras == 2 or name in MONOCULAR)
-            if known and kind == turn and re.search(only, name):
+            turn = list(_TISSUE)[(number + level // 2 + cameras) % len(_TISSUE)]
+            is_case = (level, cameras) in _CASES and (cameras == 2 or name in MONOCULAR)
+            if is_case and kind == turn and re.search(only, name):
                 # Masks that are wrong are masks that are given.
-                about = case | {"given": max(given, 1)} if name.startswith("masks") else case
-                row = _scored(folders[0], change, about, work, seed, name)
-                named = any(re.search(cause, one) for one in row["findings"]) if cause else None
-                before = {f"usual_{key}": usual[0][key] for key in ("error", "over_time")}
-                others = _causes(row) - _causes(usual[0]) - _NO_CAUSES
-                row |= {"named": named, "misnamed": named is False and bool(others)}
-                points.append({"change": name, **case, **row, **before})
+                stated_case = case | {"given": max(level, 1)} if name.startswith("masks") else case
+                row = _score(folders[0], change, stated_case, work, seed, name)
+                is_named = any(re.search(cause, finding) for finding in row["findings"]) if cause else None
+                reference = {f"usual_{key}": undegraded[0][key] for key in ("error", "over_time")}
+                other_causes = _causes(row) - _causes(undegraded[0]) - _NO_CAUSES
+                row |= {"named": is_named, "misnamed": is_named is False and bool(other_causes)}
+                points.append({"change": name, **case, **row, **reference})
     return {"seed": seed, "points": points, "undegraded": clean}
 
 
@@ -96,19 +95,19 @@ def is_vague(row: Mapping[str, Any]) -> bool:
 def judge_all(points: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """The worst outcome of each change over its recordings, by name."""
     order = "missed", "harmless", "held back", "named", "no cause to name"
-    each = report.grouped(points, "change").items()
-    return {name: min(map(judge, rows), key=order.index) for (name,), rows in each}
+    by_change = report.group_rows(points, "change").items()
+    return {name: min(map(judge, rows), key=order.index) for (name,), rows in by_change}
 
 
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means of undegraded recordings that are not held back, and the number of all."""
     keys = "error", "over_time", "width"
-    known = {key: [row[key] for row in rows if row[key] is not None] for key in keys}
-    means = {key: float(np.mean(values)) if values else None for key, values in known.items()}
+    columns = {key: [row[key] for row in rows if row[key] is not None] for key in keys}
+    means = {key: float(np.mean(values)) if values else None for key, values in columns.items()}
     return {"count": len(rows)} | means
 
 
-def _rendered(work: Path, kind: str, seed: int) -> list[Path]:
+def _render(work: Path, kind: str, seed: int) -> list[Path]:
     """Stereo recordings of 3 s that state everything, with a sensor at a higher rate and with noise."""
     data, job = work / f"{kind} {seed}", reader.load_job("mission")
     settings = {"seed": seed + list(_TISSUE).index(kind), "sequences": _CLEAN, "frames": FRAMES, "fps": FPS}
@@ -156,7 +155,7 @@ def degrade(source: Path, change: Change | None, case: Mapping[str, Any], work: 
     return folder
 
 
-def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: Path, *key: Any) -> Any:
+def _score(source: Path, change: Change | None, case: Mapping[str, Any], work: Path, *key: Any) -> Any:
     """Errors of physics' force and width of its interval, of the peak, and findings; cached in `work`."""
 
     def compute() -> dict[str, Any]:
@@ -166,28 +165,29 @@ def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: 
             result = score(folder)
         except UserError as error:
             return {**row, "findings": [str(error).replace(f"{folder}: ", "")]}
-        row["findings"] = [f"{one.cause}: {one.message}" for one in result.findings]
+        row["findings"] = [f"{finding.cause}: {finding.message}" for finding in result.findings]
         sensor, main = np.asarray(result.sensor_mn, np.float64), result.methods[result.main]
-        known = result.scored & np.isfinite(main.size_mn) & np.isfinite(sensor)
-        if result.refused or main.low_mn is None or main.high_mn is None or known.sum() < 2:
+        is_known = result.scored & np.isfinite(main.size_mn) & np.isfinite(sensor)
+        if result.refused or main.low_mn is None or main.high_mn is None or is_known.sum() < 2:
             return row
         true = read_table(source / "force.csv")
         size_mn = 1000 * np.linalg.norm(true[:, 1:], axis=1)
         true_mn, peak_mn = np.interp(result.time_s, true[:, 0], size_mn), float(size_mn.max())
-        row["error"] = abs(float(main.size_mn[known].max() - sensor[known].max())) / peak_mn
-        row["over_time"] = float(np.abs(main.size_mn - sensor)[known].mean()) / peak_mn
-        row["width"] = float((main.high_mn - main.low_mn)[known].mean()) / peak_mn
+        row["error"] = abs(float(main.size_mn[is_known].max() - sensor[is_known].max())) / peak_mn
+        row["over_time"] = float(np.abs(main.size_mn - sensor)[is_known].mean()) / peak_mn
+        row["width"] = float((main.high_mn - main.low_mn)[is_known].mean()) / peak_mn
         margin = 3 * _SENSOR_NOISE * peak_mn
         inside = (true_mn > main.low_mn - margin) & (true_mn < main.high_mn + margin)
-        row["held"] = float(inside[known].mean())
+        row["held"] = float(inside[is_known].mean())
         return row
 
-    return stored.result(work / "points", "change", stored.key(source.name, dict(case), *key), compute)
+    content_key = result_cache.key(source.name, dict(case), *key)
+    return result_cache.result(work / "points", "change", content_key, compute)
 
 
-def page(found: Mapping[str, Any]) -> report.Page:
+def page(data: Mapping[str, Any]) -> report.Page:
     """The missed rows, the outcome of every change, and errors of undegraded recordings."""
-    points, outcomes = found["points"], judge_all(found["points"])
+    points, outcomes = data["points"], judge_all(data["points"])
     missed = [row for row in points if judge(row) == "missed"]
     table = [
         {"change": row["change"], "recording": f"{row['kind']}, {row['cameras']}"}
@@ -198,11 +198,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
     for name, outcome in outcomes.items():
         names.setdefault(outcome, []).append(name)
     stated = [
-        {"stated, with all above": _GIVEN[given]}
+        {"stated, with all above": _GIVEN[level]}
         | {f"{row['kind']}, {row['cameras']}": f"{row['over_time']:.0%}" for row in rows}
-        for (given,), rows in report.grouped(found["undegraded"], "given").items()
+        for (level,), rows in report.group_rows(data["undegraded"], "given").items()
     ]
-    counts = {outcome: len(some) for outcome, some in names.items()}
+    counts = {outcome: len(changes) for outcome, changes in names.items()}
     faults = len(outcomes) - counts.get("no cause to name", 0)
     caught = counts.get("named", 0) + counts.get("held back", 0)
     verdict = f"**Of {faults} faults {caught} are named or held back in every recording, "
@@ -210,13 +210,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
     if stated_rows := [row for row in points if row.get("width") is not None]:
         vague = sum(map(is_vague, stated_rows))
         verdict += f" Of {len(stated_rows)} stated forces {vague} have an interval wider than the peak."
-    others = [f"*{outcome}*: {'; '.join(some)}." for outcome, some in names.items()]
+    others = [f"*{outcome}*: {'; '.join(changes)}." for outcome, changes in names.items()]
     sections = [
         report.Section("Missed", table),
         report.Section("Each change, by its worst recording", (), others),
         report.Section("Undegraded: mean error, of the peak", stated),
     ]
-    return report.Page("Scoring: degraded recordings", found, (verdict, _CASES_ARE), sections)
+    return report.Page("Scoring: degraded recordings", data, (verdict, _CASES_ARE), sections)
 
 
 _COLUMNS = {

@@ -85,26 +85,26 @@ class Clip:
         return np.broadcast_to(np.float32(1), (self.frames, 1 + has_depth(source), *self.mask.shape))
 
 
-def has_depth(wanted: str) -> bool:
+def has_depth(source: str) -> bool:
     """Whether an input kind or a source is motion in three dimensions, from stereo."""
-    return wanted.startswith("motion")
+    return source.startswith("motion")
 
 
-def scored_source(wanted: Input) -> str:
+def scored_source(kind: Input) -> str:
     """The source that a model of an input kind is scored on: of a mixture the recovered one."""
-    return sources(wanted)[-1]
+    return sources(kind)[-1]
 
 
-def sources(wanted: Input) -> tuple[str, ...]:
+def sources(kind: Input) -> tuple[str, ...]:
     """Displacements that an input kind uses."""
-    return _MIXED.get(wanted, (wanted,))
+    return _MIXED.get(kind, (kind,))
 
 
-def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
-    """One store on the grid, with displacements `wanted` of `FIELDS`. UserError if it lacks one of them or
-    tissue, or if values don't match their seal."""
-    wanted = tuple(wanted)
-    check_readable(sequence, wanted)
+def read_clip(sequence: Sequence, grid: Grid, source_names: Iterable[str]) -> Clip:
+    """One store on the grid, with the displacements of some names in `FIELDS`. UserError if it lacks one of
+    them or tissue, or if values don't match their seal."""
+    source_names = tuple(source_names)
+    check_readable(sequence, source_names)
     if sequence.attrs.get("young_kpa") is None:
         raise UserError(f"{sequence.path}: lacks the attribute young_kpa; set fem.young_kpa in its job")
     young, scale = (float(sequence.attrs[name]) for name in ("young_kpa", "scale_mm_per_px"))
@@ -120,9 +120,9 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
         return on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1) * mm)
 
     confidence, spatial = np.ones((sequence.frames, grid.size, grid.size), np.float32), None
-    if "recovered" in wanted and "flow_confidence" in sequence:
+    if "recovered" in source_names and "flow_confidence" in sequence:
         confidence = on_grid("flow_confidence", np.asarray)
-    if "motion" in wanted:
+    if "motion" in source_names:
         spatial = on_grid("motion_deviation", certainty)
     loads = (traction.transpose(2, 0, 1) * area for traction in sequence.read_sealed("traction"))
     density = np.stack([settle(view.sum(load), view.mask) for load in loads])
@@ -130,7 +130,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     return Clip(
         **_plain(sequence),
         mask=view.mask,
-        displacement={source: displacement(source) for source in wanted},
+        displacement={source: displacement(source) for source in source_names},
         confidence=confidence,
         density=density,
         force=force,
@@ -138,15 +138,15 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     )
 
 
-def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
+def check_readable(sequence: Sequence, source_names: Iterable[str]) -> None:
     """Raises UserError if a store lacks a displacement of `FIELDS`, or its scale."""
-    for source in wanted:
+    for source in source_names:
         if FIELDS[source] not in sequence:
-            what = "stereo motion" if has_depth(source) else f"{source} flow"
+            kind = "stereo motion" if has_depth(source) else f"{source} flow"
             alike = (name for name in FIELDS if has_depth(name) is has_depth(source))
             others = [f"use --input {name}" for name in alike if FIELDS[name] in sequence]
             hint = ", or ".join([_CURE[source], *others[:1]])
-            raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
+            raise UserError(f"{sequence.path}: holds no {kind} (field {FIELDS[source]}); {hint}")
     if sequence.attrs.get("scale_mm_per_px") is None:
         raise UserError(f"{sequence.path}: lacks the attribute scale_mm_per_px")
 
@@ -169,7 +169,7 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
 def load_clips(
     root: Path,
     grid: Grid,
-    wanted: Iterable[str],
+    source_names: Iterable[str],
     *,
     cache: Path | None = None,
     report: ProgressCallback = lambda done, of: None,
@@ -180,24 +180,24 @@ def load_clips(
     grid and the version of packing (`synth.formats.CLIPS`), so it can be shared. Raises UserError for an
     empty dataset, and for a sequence whose attributes or values don't match their seal.
     """
-    wanted = tuple(wanted)
+    source_names = tuple(source_names)
     dataset = Dataset(root)
     clips = []
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
-        packed = cache and _pack(sequence, grid, wanted, cache)
-        clips.append(packed or read_clip(sequence, grid, wanted))
+        clip = cache and _pack(sequence, grid, source_names, cache)
+        clips.append(clip or read_clip(sequence, grid, source_names))
     report(len(dataset), len(dataset))
     return clips
 
 
-def _pack(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+def _pack(sequence: Sequence, grid: Grid, source_names: tuple[str, ...], cache: Path) -> Clip:
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
-    key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, CLIPS]
+    key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *source_names, CLIPS]
     file = cache / f"{identity.digest(key)}.safetensors"
     if not file.is_file():
-        pack(read_clip(sequence, grid, wanted), file)
+        pack(read_clip(sequence, grid, source_names), file)
     return replace(unpack(file), **_plain(sequence))
 
 
@@ -217,9 +217,9 @@ def unpack(file: Path) -> Clip:
     """A packed clip, memory-mapped; no file stays open. Raises UserError if it is not one, or damaged."""
     checked_file.check_file(file, 64 << 30)
     with as_user_error(f"{file}: can't be read as a packed sequence"):
-        with safe_open(file, "pt") as opened:
-            plain = json.loads(opened.metadata()["clip"])
-            arrays = {name: opened.get_tensor(name).numpy() for name in opened.keys()}  # noqa: SIM118
+        with safe_open(file, "pt") as archive:
+            plain = json.loads(archive.metadata()["clip"])
+            arrays = {name: archive.get_tensor(name).numpy() for name in archive.keys()}  # noqa: SIM118
         if plain.pop("checksum") != _checksum(arrays):
             raise ValueError("damaged: the checksum does not match")
         for array in arrays.values():

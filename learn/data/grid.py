@@ -89,8 +89,8 @@ class GridView:
     def mean(self, values: NDArray[np.floating]) -> Map:
         """Mean (..., N, N) over the tissue in each cell of values (..., H, W); 0 where there is none."""
         over = self._each(values * self.tissue.astype(np.float32), self._rows, self._cols)
-        good = self._share > 1e-6
-        return np.where(good, over / np.where(good, self._share, 1.0), 0.0).astype(np.float32)
+        is_covered = self._share > 1e-6
+        return np.where(is_covered, over / np.where(is_covered, self._share, 1.0), 0.0).astype(np.float32)
 
     def sum(self, values: NDArray[np.floating]) -> Map:
         """Totals (..., N, N) of amounts per pixel (..., H, W), with the same sum inside the grid."""
@@ -124,10 +124,10 @@ def to_image(
     """Values (N, N) of a grid's cells at the pixels of a picture of `shape` (H, W), bilinear, 0 outside the
     grid; `centre_px`: x, y of the grid's centre in it."""
     ratio, middle = scale_mm_per_px / pitch_mm, (len(values) - 1) / 2
-    axes = [(np.arange(n) - at) * ratio for n, at in zip(shape, centre_px[::-1], strict=True)]
+    axes = [(np.arange(n) - origin) * ratio for n, origin in zip(shape, centre_px[::-1], strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"))
-    shown = ndimage.map_coordinates(values, cells + middle, order=1, mode="nearest")
-    return np.where((np.abs(cells) <= middle + 0.5).all(axis=0), shown, 0).astype(np.float32)
+    sampled = ndimage.map_coordinates(values, cells + middle, order=1, mode="nearest")
+    return np.where((np.abs(cells) <= middle + 0.5).all(axis=0), sampled, 0).astype(np.float32)
 
 
 def settle(amount: Map, mask: Map) -> Map:
@@ -139,10 +139,10 @@ def settle(amount: Map, mask: Map) -> Map:
     out = np.where(inside, amount, np.float32(0))
     rows, cols = np.nonzero(~inside & (amount != 0).any(0))
     if rows.size:
-        near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        to = near[0][rows, cols], near[1][rows, cols]
-        for plane, lost in zip(out, amount[:, rows, cols], strict=True):
-            np.add.at(plane, to, lost)
+        nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        targets = nearest[0][rows, cols], nearest[1][rows, cols]
+        for plane, amounts in zip(out, amount[:, rows, cols], strict=True):
+            np.add.at(plane, targets, amounts)
     return out
 
 
@@ -169,9 +169,9 @@ def _partition(hats: sparse.csr_array) -> sparse.csr_array:
     return (hats @ sparse.diags_array(scale.astype(np.float32))).tocsr()
 
 
-def membrane_code(known: MembraneState) -> float:
+def membrane_code(state: MembraneState) -> float:
     """Value of the membrane channel: -1 stripped, 0 unknown, 1 intact."""
-    return get_args(MembraneState).index(known) - 1.0
+    return get_args(MembraneState).index(state) - 1.0
 
 
 def certainty(deviation_mm: Map) -> Map:

@@ -41,22 +41,23 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
     intervals = predictor.card.intervals
     assert intervals is not None
     rows: dict[float, list[dict[str, float]]] = {level: [] for level in LEVELS}
-    far = [np.zeros(0)]
+    clip_distances = [np.zeros(0)]
     for clip in clips:
         predicted = predict_clip(predictor, clip, source)
         for level, clip_rows in rows.items():
             clip_rows.append(_cover_clip(intervals, predicted, clip, level))
-        far.append(intervals.distribution.relative_distance(predicted.motion)[is_moving(predicted.motion)])
-    moved, out = np.concatenate(far), []
+        motion = predicted.motion
+        clip_distances.append(intervals.distribution.relative_distance(motion)[is_moving(motion)])
+    distances, coverages = np.concatenate(clip_distances), []
     for level, clip_rows in rows.items():
         rng = np.random.default_rng(0)
         columns = {name: np.array([row[name] for row in clip_rows]) for name in clip_rows[0]}
         shares = {name: interval(columns.pop(name), rng) for name in ("size", *"xyz")}
         values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else math.nan for k, v in columns.items()}
-        values["out_of_distribution"] = float((moved > 1).mean()) if len(moved) else math.nan
-        values["distance"] = float(np.median(moved)) if len(moved) else math.nan
-        out.append(Coverage(level, shares, values))
-    return out
+        values["out_of_distribution"] = float((distances > 1).mean()) if len(distances) else math.nan
+        values["distance"] = float(np.median(distances)) if len(distances) else math.nan
+        coverages.append(Coverage(level, shares, values))
+    return coverages
 
 
 def _cover_clip(intervals: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:

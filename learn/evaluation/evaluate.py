@@ -55,7 +55,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     true_mn: Floats = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
     centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
-    off = [d for d in (float(np.linalg.norm(centre)) for centre in centres) if math.isfinite(d)]
+    distances = [d for d in (float(np.linalg.norm(centre)) for centre in centres) if math.isfinite(d)]
     peak = float(true_mn.max())
     others = {}
     if parts == 3:
@@ -66,7 +66,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
         "false_positive_relative": false_positive_share(size, free, LOW * unit),
         "off_target_mn": float((size * free).sum((1, 2)).mean() * pitch**2),
-        "localisation_mm": float(np.median(off)) if off else math.nan,
+        "localisation_mm": float(np.median(distances)) if distances else math.nan,
         "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
     }
     agreed = moments(true_size[inside], size[inside])
@@ -114,8 +114,8 @@ class EvaluationReport:
 
 
 def _mean(values: Sequence[float]) -> float:
-    good = [v for v in values if math.isfinite(v)]
-    return float(np.mean(good)) if good else math.nan
+    finite = [v for v in values if math.isfinite(v)]
+    return float(np.mean(finite)) if finite else math.nan
 
 
 def evaluate(

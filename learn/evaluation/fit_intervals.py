@@ -35,12 +35,12 @@ def add_intervals(
     the factors. UserError if nothing moves.
     """
     selection, calibration = ([clips[i] for i in part] for part in (split.select, split.intervals))
-    why, intervals = find_obstacle(selection, calibration), None
-    if not why:
+    obstacle, intervals = find_obstacle(selection, calibration), None
+    if not obstacle:
         source = scored_source(predictor.card.settings.input)
         fitted = [clips[i] for i in split.fit if source in clips[i].displacement]
         intervals = _fit(predictor, (fitted, selection, calibration), source, report)
-    card = replace(predictor.card, intervals=intervals, no_intervals=why)
+    card = replace(predictor.card, intervals=intervals, no_intervals=obstacle)
     write_card(folder, card)
     return card
 
@@ -57,14 +57,14 @@ def _fit(
         true = clip.force / clip.young_kpa
         examples.append(make_example(predict_clip(predictor, clip, source), true, brain, unit))
     report(len(brains), len(brains))
-    some = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
-    motion = [_features(clip, source, card.settings.extent_mm) for clip in some]
+    sample = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
+    motion = [_features(clip, source, card.settings.extent_mm) for clip in sample]
     first, second = examples[: len(selection)], examples[len(selection) :]
-    distribution = fit_distribution(motion, [one.motion for one in first])
+    distribution = fit_distribution(motion, [example.motion for example in first])
     if distribution is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
     # A recording's distance doesn't depend on errors: all sequences but the training ones count.
-    distribution = distribution.calibrated([example.motion for example in examples])
+    distribution = distribution.calibrate([example.motion for example in examples])
     return fit(first, second, distribution, motion_names(card.settings.arch.depth), unit, source)
 
 

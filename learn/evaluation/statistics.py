@@ -67,9 +67,9 @@ def over_groups(
     """Mean over recordings, NaN left out, and its percentile interval, for which whole groups (specimens) are
     drawn; NaN with fewer than `LEAST_GROUPS`."""
     v = np.asarray(values, np.float64)
-    known = np.isfinite(v)
-    of = np.unique(np.asarray(groups)[known], return_inverse=True)[1]
-    sums, sizes = np.bincount(of, v[known]), np.bincount(of)
+    is_finite = np.isfinite(v)
+    group_indices = np.unique(np.asarray(groups)[is_finite], return_inverse=True)[1]
+    sums, sizes = np.bincount(group_indices, v[is_finite]), np.bincount(group_indices)
 
     def mean(sums: Floats, sizes: Floats, axis: int) -> Floats:
         return np.asarray(sums.sum(axis) / sizes.sum(axis))

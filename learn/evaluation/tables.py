@@ -16,12 +16,12 @@ FIRST = ("force_mae", "force_r2_pooled", "peak_error_share", "map_r2_pooled")  #
 
 def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
     """Means over sequences; `all`: every score."""
-    table, means, sure = open_table(title, "mean [95%]"), report.summary(), report.intervals()
+    table, means, intervals = open_table(title, "mean [95%]"), report.summary(), report.intervals()
     for key, metric in METRICS.items():
         if key in means and (metric.listed if all else key in FIRST):
             cell = _cell(metric, means[key])
-            if key in sure and sure[key].low == sure[key].low:
-                cell += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
+            if key in intervals and intervals[key].low == intervals[key].low:
+                cell += f" [{_cell(metric, intervals[key].low)}, {_cell(metric, intervals[key].high)}]"
             table.add_row(metric.heading, cell)
     return table
 

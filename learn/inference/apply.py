@@ -12,7 +12,7 @@ import numpy as np
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.predict import Predictor, force_size, load_model, net_force
-from learn.inference.video_motion import Motion, SecondCamera, motions, read_only, read_options
+from learn.inference.video_motion import Motion, SecondCamera, motions, read_options, read_single
 from learn.uncertainty.conformal import LEVELS
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
@@ -75,7 +75,7 @@ def predict(
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     predictor = model if isinstance(model, Predictor) else load_model(model)
     check_cameras(predictor, second)
-    motion = read_only(source, motions(source, predictor.choose_source(input), options))
+    motion = read_single(source, motions(source, predictor.choose_source(input), options))
     return apply(predictor, motion, young_kpa, membrane)
 
 
@@ -101,13 +101,13 @@ def apply(
         rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
         forces.append(estimator.estimate(frame))
     findings = problems([*judge_young(young), *motion.findings])
-    numbers, times, followed = map(np.array, zip(*rows, strict=True))
-    trusted = followed & (not first_fault(findings))
-    force = np.where(trusted[:, None], [each.force_mn for each in forces], np.nan)
+    numbers, times, is_tracked = map(np.array, zip(*rows, strict=True))
+    trusted = is_tracked & (not first_fault(findings))
+    force = np.where(trusted[:, None], [estimate.force_mn for estimate in forces], np.nan)
     last = forces[-1].map
-    centres = to_video_px(np.array([each.map.view.centre_px for each in forces]), motion)
+    centres = to_video_px(np.array([estimate.map.view.centre_px for estimate in forces]), motion)
     out: dict[str, Any] = {
-        "density": np.stack([each.map.density for each in forces]),
+        "density": np.stack([estimate.map.density for estimate in forces]),
         "total_force_mn": np.where(trusted, force_size(force), np.nan),
         "trusted": trusted,
         "mask": last.view.mask,
@@ -161,8 +161,8 @@ def _ends(forces: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
     names = {"low": "low_mn", "high": "high_mn", "axes_low": "force_low_mn", "axes_high": "force_high_mn"}
     out = {name: [band[end] for band in wide] for end, name in names.items()}
     out |= {f"{end}68_mn": [band[end] for band in narrow] for end in ("low", "high")}
-    sure = np.where(trusted, 1.0, np.nan)
-    return {name: (np.concatenate(ends).T * sure).T for name, ends in out.items()}
+    validity = np.where(trusted, 1.0, np.nan)
+    return {name: (np.concatenate(ends).T * validity).T for name, ends in out.items()}
 
 
 def calibrate(predictor: Predictor, press: Motion) -> float:

@@ -34,8 +34,8 @@ class Portable(nn.Module):
         self.network, self.card, self.gain = network, card, gain
 
     def forward(self, displacement: Tensor, mask: Tensor, *others: Tensor) -> Tensor:
-        known = dict(zip(input_names(self.card)[2:], others, strict=True))
-        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, **known)
+        options = dict(zip(input_names(self.card)[2:], others, strict=True))
+        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, **options)
         y: Tensor = self.network(x) * (self.card.scales.target * self.gain)
         return y
 
@@ -48,10 +48,10 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
     parts = card.settings.arch.displacements
     a = rng.normal(size=(batch, parts, 6))
     basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
-    moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
+    displacement = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
     mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
     inputs = {
-        "displacement": moved,
+        "displacement": displacement,
         "mask": mask,
         "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
         "membrane": rng.integers(-1, 2, batch),
@@ -92,8 +92,8 @@ def to_onnx(
     for inputs in cases:
         expected = module(*inputs)
         largest = max(card.scales.target, float(expected.abs().max()))
-        named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        output = torch.from_numpy(session.run(None, named)[0])
+        feeds = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+        output = torch.from_numpy(session.run(None, feeds)[0])
         worst = max(worst, float((output - expected).abs().max()) / largest)
     if not worst <= (TOLERANCE if tolerance is None else tolerance):
         raise UserError(f"in ONNX the network differs from PyTorch by {worst:.1e} of full scale: too much")

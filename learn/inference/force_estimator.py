@@ -19,7 +19,7 @@ from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.recording.frame_motion import FrameMotion
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
 
@@ -52,16 +52,18 @@ def predict_force(
     """
     if len(size := np.shape(tissue)) != 2:
         raise UserError(f"tissue: expected an array (H, W), got {size}")
-    inside = check_answer("predict_force", "tissue", tissue, size) != 0
-    estimator = ForceEstimator(model, inside, scale_mm_per_px, young_kpa, membrane)
-    sure, forces = np.ones(size, np.float32), list[Floats]()
-    pairs = ((step, sure) for step in flow) if confidence is None else zip_longest(flow, confidence)
-    for moved, weight in pairs:
-        if moved is None or weight is None:
+    mask = check_answer("predict_force", "tissue", tissue, size) != 0
+    estimator = ForceEstimator(model, mask, scale_mm_per_px, young_kpa, membrane)
+    full_confidence, forces = np.ones(size, np.float32), list[Floats]()
+    pairs = (
+        ((step, full_confidence) for step in flow) if confidence is None else zip_longest(flow, confidence)
+    )
+    for step, weight in pairs:
+        if step is None or weight is None:
             raise UserError("confidence: has another number of frames than flow")
-        moved = check_answer("predict_force", "flow", moved, (*size, 2))
+        step = check_answer("predict_force", "flow", step, (*size, 2))
         weight = check_answer("predict_force", "confidence", weight, size, (0.0, 1.0))
-        forces.append(estimator.estimate(FrameMotion(moved, weight)).force_mn)
+        forces.append(estimator.estimate(FrameMotion(step, weight)).force_mn)
     return np.array(forces).reshape(-1, 3)
 
 
@@ -103,9 +105,11 @@ class ForceEstimator:
         place = self.placement.place(frame.flow, frame.confidence)
         force_map = self._predict(frame, place)
         if place not in self._at_rest:
-            motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
-            still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
-            self._at_rest[place] = self._predict(still, place)
+            motion = frame.motion and Motion3D(0 * frame.motion.motion, 0 * frame.motion.deviation)
+            rest_motion = FrameMotion(
+                np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion
+            )
+            self._at_rest[place] = self._predict(rest_motion, place)
         # In a lost frame no pixel reaches the confidence of tracked tissue.
         if force_map.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
             self._tracked.append(force_map.motion)
@@ -120,8 +124,8 @@ class ForceEstimator:
         notes = ["this network has no membrane input: --membrane is ignored"] if ignored else []
         if self.placement.fits:
             return notes
-        wide = self._predictor.grid.extent_mm
-        note = f"the tissue is wider than the network's {wide:g} mm: its grid lies on what moves most"
+        extent_mm = self._predictor.grid.extent_mm
+        note = f"the tissue is wider than the network's {extent_mm:g} mm: its grid lies on what moves most"
         note += f", and was moved {self.placement.moves} times" if self.placement.moves else ""
         return [*notes, note]
 
@@ -139,8 +143,8 @@ class ForceEstimator:
         return notes
 
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
-        given = frame.flow, self._tissue, self._scale, self._young_kpa, frame.confidence, frame.motion
-        force_map = self._predictor(*given, centre_px=place, membrane=self._membrane)
+        inputs = frame.flow, self._tissue, self._scale, self._young_kpa, frame.confidence, frame.motion
+        force_map = self._predictor(*inputs, centre_px=place, membrane=self._membrane)
         if force_map.young_known:
             return force_map
         part = np.float32(UNKNOWN_YOUNG_KPA / force_map.young_kpa)

@@ -27,9 +27,9 @@ class GridPlacement:
         self.moves = 0  # number of times the grid was moved
         rows, columns = np.nonzero(tissue)
         self._half = 0.5 * grid.extent_mm / check_scale(scale_mm_per_px)
-        away = np.maximum(abs(columns - self.centre_px[0]), abs(rows - self.centre_px[1]))
+        distance = np.maximum(abs(columns - self.centre_px[0]), abs(rows - self.centre_px[1]))
         # Whether the grid covers all of the tissue, so that it needn't be moved.
-        self.fits = float(np.mean(away > self._half + 0.5)) <= _CUT_OFF
+        self.fits = float(np.mean(distance > self._half + 0.5)) <= _CUT_OFF
         self._tissue = tissue
         self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
 
@@ -41,25 +41,25 @@ class GridPlacement:
         power = np.square(flow.astype(np.float32)).sum(-1) * usable
         if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
             return self.centre_px
-        place = self._within(self._strongest(power))
+        place = self._within(self._find_strongest(power))
         if max(abs(a - b) for a, b in zip(place, self.centre_px, strict=True)) > _OFF_CENTRE * 2 * self._half:
             self.centre_px, self.moves = place, self.moves + 1
         return self.centre_px
 
-    def _strongest(self, power: Map) -> Point:
+    def _find_strongest(self, power: Map) -> Point:
         """The centre of the strongest motion; of two places the stronger, not their mean."""
         height, width = power.shape
         size = (max(1, width // _COARSE), max(1, height // _COARSE))
-        small = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
+        coarse = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
         step = width / size[0], height / size[1]
-        near = cv2.GaussianBlur(small, (0, 0), max(0.5 * self._half / step[0], 0.5), borderType=0)
-        row, column = np.unravel_index(int(near.argmax()), near.shape)
+        smoothed = cv2.GaussianBlur(coarse, (0, 0), max(0.5 * self._half / step[0], 0.5), borderType=0)
+        row, column = np.unravel_index(int(smoothed.argmax()), smoothed.shape)
         return (float(column) + 0.5) * step[0] - 0.5, (float(row) + 0.5) * step[1] - 0.5
 
     def _within(self, point: Point) -> Point:
         """The nearest centre whose grid reaches as little as possible beyond the tissue."""
-        placed = []
+        position = []
         for value, (low, high) in zip(point, self._ends, strict=True):
             low, high = low + self._half, high - self._half
-            placed.append(min(max(value, low), high) if low < high else (low + high) / 2)
-        return placed[0], placed[1]
+            position.append(min(max(value, low), high) if low < high else (low + high) / 2)
+        return position[0], position[1]

@@ -18,7 +18,7 @@ from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
 from synth.errors import Caution, UserError, as_positive, as_user_error
 from synth.flow import onnx_network
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 from synth.formats import TRAINING
 from synth.job import identity
 from synth.job.types import MembraneState
@@ -53,14 +53,14 @@ def _convert(folder: Path, card: ModelCard) -> bytes:
     def make() -> bytes:
         from learn.inference.convert import convert  # PyTorch, which nothing else here needs
 
-        why = "holds its weights for PyTorch only: they are converted to ONNX once, into the user's cache"
-        warnings.warn(f"{folder}: {why}", Caution, stacklevel=2)
+        reason = "holds its weights for PyTorch only: they are converted to ONNX once, into the user's cache"
+        warnings.warn(f"{folder}: {reason}", Caution, stacklevel=2)
         return convert(folder)
 
     # The file holds the networks' code too, whose version is TRAINING.
     inputs = {"settings": card.settings.model_dump(mode="json"), "scales": asdict(card.scales)}
     key = identity.digest({"weights": card.weights_hash, "code": TRAINING, **inputs}).encode()
-    return cache.cached("networks/onnx", key, make, bytes, bytes, (), _KEPT)
+    return cache.load_or_make("networks/onnx", key, make, bytes, bytes, (), _KEPT)
 
 
 def input_names(card: ModelCard) -> list[str]:
@@ -76,7 +76,7 @@ class Predictor:
         """`network`: in ONNX, as of `learn.inference.convert`. UserError: it is none, or of another card."""
         self.card, self.grid = card, card.settings.grid
         self._network = onnx_network.open_network(network, "network.onnx", threads)
-        if [given.name for given in self._network.get_inputs()] != input_names(card):
+        if [node.name for node in self._network.get_inputs()] != input_names(card):
             raise UserError("network.onnx: its inputs are not those of config.json")
         self._view: GridView | None = None
 
@@ -84,8 +84,8 @@ class Predictor:
         """The source of displacement as given. Raises UserError if this model can't use it."""
         fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
         if source not in fit:
-            what = "this model can't use" if source in FIELDS else "unknown"
-            raise UserError(f"{what} input {source!r}: one of {', '.join(fit)}")
+            problem = "this model can't use" if source in FIELDS else "unknown"
+            raise UserError(f"{problem} input {source!r}: one of {', '.join(fit)}")
         return source
 
     def choose_source(self, source: str | None) -> str:
@@ -100,7 +100,7 @@ class Predictor:
         scale_mm_per_px: float,
         young_kpa: float | None = None,
         confidence: Map | None = None,
-        moved: Moved | None = None,
+        moved: Motion3D | None = None,
         *,
         centre_px: tuple[float, float] | None = None,
         membrane: MembraneState = "unknown",
@@ -126,15 +126,15 @@ class Predictor:
             self._view = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
         view = self._view
         displacement, cell_confidence = self.on_grid(view, flow, confidence, moved)
-        known = None if cell_confidence is None else cell_confidence[None]
-        density = self.density(displacement[None], view.mask, young, known, membrane)
+        batch_confidence = None if cell_confidence is None else cell_confidence[None]
+        density = self.density(displacement[None], view.mask, young, batch_confidence, membrane)
         motion = None
         if self.card.intervals is not None:
-            motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
+            motion = motion_features(displacement[None], view.mask, batch_confidence, self.grid.extent_mm)[0]
         return ForceMap(density[0], self.grid, young, young_kpa is not None, view, motion)
 
     def on_grid(
-        self, view: GridView, flow: Map, confidence: Map | None = None, moved: Moved | None = None
+        self, view: GridView, flow: Map, confidence: Map | None = None, moved: Motion3D | None = None
     ) -> tuple[Map, Map | None]:
         """Displacement (C, N, N) mm of a frame and its confidence (C - 1, N, N); arguments as `__call__`."""
         height, width = view.tissue.shape
@@ -150,9 +150,9 @@ class Predictor:
                 "this model needs motion in three dimensions: give right and calibration, or a recording "
                 "with a right or depth camera"
             )
-        for what, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
+        for label, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
             if values.shape != (height, width, 3):
-                raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")
+                raise UserError(f"{label}: expected ({height}, {width}, 3), got {values.shape}")
         return view.mean(moved.motion.transpose(2, 0, 1)), view.mean(certainty(moved.deviation))
 
     def density(
@@ -187,19 +187,19 @@ class Predictor:
         maps = []
         for start in range(0, len(displacement), settings.batch):
             frames = slice(start, start + settings.batch)
-            moved = np.asarray(displacement[frames], np.float32)
-            inside = np.broadcast_to(np.asarray(mask, np.float32), (len(moved), 1, n, n))
-            known = {"displacement": moved, "mask": np.ascontiguousarray(inside)}
+            shift = np.asarray(displacement[frames], np.float32)
+            inside = np.broadcast_to(np.asarray(mask, np.float32), (len(shift), 1, n, n))
+            inputs = {"displacement": shift, "mask": np.ascontiguousarray(inside)}
             if settings.arch.confidence:
-                certain = np.ones((len(moved), parts - 1, n, n), np.float32)
-                known["confidence"] = (
-                    certain if confidence is None else np.asarray(confidence[frames], np.float32)
+                full_confidence = np.ones((len(shift), parts - 1, n, n), np.float32)
+                inputs["confidence"] = (
+                    full_confidence if confidence is None else np.asarray(confidence[frames], np.float32)
                 )
             if settings.arch.membrane:
-                known["membrane"] = np.full(len(moved), membrane_code(membrane), np.float32)
+                inputs["membrane"] = np.full(len(shift), membrane_code(membrane), np.float32)
             with as_user_error("the network"):
-                (output,) = self._network.run(["density"], known)
-            maps.append(_check_shape(output, (len(moved), settings.arch.components, n, n)))
+                (output,) = self._network.run(["density"], inputs)
+            maps.append(_check_shape(output, (len(shift), settings.arch.components, n, n)))
         with np.errstate(over="ignore", invalid="ignore"):  # checked below
             density = np.concatenate(maps) * np.float32(self.card.force_gain * young_kpa)
         if not np.isfinite(density).all():

@@ -83,8 +83,8 @@ class PredictedFile(NamedTuple):
     @property
     def text(self) -> str:
         """One line for a terminal."""
-        what = "no frame has a force" if self.peak_mn is None else f"peak force {self.peak_mn:.3g} mN"
-        return f"{self.name}: {self.frames} frames, {what}"
+        outcome = "no frame has a force" if self.peak_mn is None else f"peak force {self.peak_mn:.3g} mN"
+        return f"{self.name}: {self.frames} frames, {outcome}"
 
 
 def summarise(files: Sequence[PredictedFile], out: Path) -> dict[str, Any]:
@@ -95,26 +95,26 @@ def summarise(files: Sequence[PredictedFile], out: Path) -> dict[str, Any]:
 
 def predict_files(
     estimate: Callable[[Motion], dict[str, Any]],
-    each: Iterable[Motion],
+    videos: Iterable[Motion],
     source: Path,
     out: Path,
     overlay: bool = False,
 ) -> Iterator[PredictedFile]:
     """Estimates and writes the forces of each video of a source, one after the other, into the folder `out`.
 
-    `estimate`: the forces of a motion, as of `apply`; `each`: the source's motions; `overlay`: whether to
+    `estimate`: the forces of a motion, as of `apply`; `videos`: the source's motions; `overlay`: whether to
     write NAME.force.mp4 where the source has pictures. UserError as those, and for a file that would
     overwrite its source.
     """
-    alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
-    for motion in each:
+    is_single = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
+    for motion in videos:
         stem = out / motion.name
         if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
             raise UserError(f"{file}: is the input and would be overwritten; choose another --out")
         prediction = estimate(motion)
         write_prediction(prediction, stem)
         if overlay:
-            write_overlay(prediction, source if alone else source / f"{motion.name}.zarr", stem)
+            write_overlay(prediction, source if is_single else source / f"{motion.name}.zarr", stem)
         size = prediction["total_force_mn"][prediction["trusted"]]
         peak = float(size.max()) if len(size) else None
         yield PredictedFile(motion.name, len(prediction["trusted"]), peak, prediction["notes"].tolist())
@@ -141,29 +141,32 @@ def write_prediction(prediction: dict[str, Any], stem: Path) -> None:
 def write_overlay(prediction: dict[str, Any], source: Path, stem: Path) -> Path | None:
     """Writes `stem`.force.mp4: the processed frames with the rest frame's force map and the curve below.
 
-    `found`: of `apply`; `source`: a video or a sequence's store. None, without a file, if it has no pictures.
+    `prediction`: of `apply`; `source`: a video or a sequence's store. None, without a file, if it has no
+    pictures.
     """
-    wanted = {int(number) for number in prediction["frame"]}
+    numbers = {int(number) for number in prediction["frame"]}
     if video.is_video(source):
-        pictures = (frame.rgb for frame in video.read_frames(source, video.FPS) if frame.index in wanted)
+        pictures = (frame.rgb for frame in video.read_frames(source, video.FPS) if frame.index in numbers)
     elif source.suffix == ".zarr":
         sequence = open_sequence(source)
-        pictures = (sequence["rgb"][t] for t in sorted(wanted))
+        pictures = (sequence["rgb"][t] for t in sorted(numbers))
     else:
         return None
     times = prediction.get("time_s", np.arange(len(prediction["frame"])) / video.FPS)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
-    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(prediction, times, pictures), fps)
+    return encode_video(
+        stem.with_name(f"{stem.name}.force.mp4"), _draw_frames(prediction, times, pictures), fps
+    )
 
 
-def _drawn(prediction: dict[str, Any], times: Floats, pictures: Iterator[Pixels]) -> Iterator[Pixels]:
+def _draw_frames(prediction: dict[str, Any], times: Floats, pictures: Iterator[Pixels]) -> Iterator[Pixels]:
     force, size = prediction["total_force_mn"], length(prediction["density"])
     largest, curve = float(np.max(size, initial=0.0)), None
     for t, rgb in enumerate(pictures):
         shrink = max(1, -(-rgb.shape[1] // _WIDEST_PX))
         small = cv2.resize(rgb, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-        small = picture.legible(np.asarray(small, np.uint8))
+        small = picture.enlarge(np.asarray(small, np.uint8))
         place = (
             prediction["centres_px"][t],
             float(prediction["scale_mm_per_px"]),
@@ -173,13 +176,13 @@ def _drawn(prediction: dict[str, Any], times: Floats, pictures: Iterator[Pixels]
         values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
             curve = sequence_video.draw_curve(times, force, small.shape[1])
-        known = "" if prediction["young_known"] else f", if E is {prediction['young_kpa']:.3g} kPa"
+        assumption = "" if prediction["young_known"] else f", if E is {prediction['young_kpa']:.3g} kPa"
         ends = (
             f" [{prediction['low_mn'][t]:.1f}, {prediction['high_mn'][t]:.1f}]"
             if "low_mn" in prediction
             else ""
         )
-        text = f"{force[t]:.1f} mN{ends}{known}" if prediction["trusted"][t] else "could not be followed"
-        shown = sequence_video.glow(small, values, largest) if prediction["trusted"][t] else small
-        shown = picture.caption(shown, f"{times[t]:.2f} s  {text}")
-        yield np.vstack([shown, sequence_video.mark(curve, t, len(force))])
+        text = f"{force[t]:.1f} mN{ends}{assumption}" if prediction["trusted"][t] else "could not be followed"
+        frame = sequence_video.glow(small, values, largest) if prediction["trusted"][t] else small
+        frame = picture.caption(frame, f"{times[t]:.2f} s  {text}")
+        yield np.vstack([frame, sequence_video.mark(curve, t, len(force))])

@@ -15,9 +15,9 @@ LICENCE = "Apache-2.0"
 """Of the shipped weights, as of the code: they were trained on this project's renders alone."""
 
 
-def find_model(named: Path | str) -> Path:
+def find_model(name: Path | str) -> Path:
     """The folder of a model: a folder of that name, else of the pretrained network."""
-    return MODELS / named if str(named) in NAMES and not Path(named).exists() else Path(named)
+    return MODELS / name if str(name) in NAMES and not Path(name).exists() else Path(name)
 
 
 def find_name(card: ModelCard) -> str:

@@ -23,7 +23,7 @@ from synth.flow.recording.pair_findings import judge_pair
 from synth.flow.recording.stereo_motion import RightVideo
 from synth.flow.recording.video_track import track_video
 from synth.flow.stereo.calibration import read_rig
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 from synth.system import checked_file
 from synth.video import file_numbers
 from synth.video import read_video as video
@@ -107,10 +107,10 @@ def read_options(
     return VideoOptions(scale_mm_per_px, tissue, replace(settings, masks=kind), tool, fps, rest_frame, second)
 
 
-def read_only(source: Path | Array, each: Iterator[Motion]) -> Motion:
+def read_single(source: Path | Array, videos: Iterator[Motion]) -> Motion:
     """The motion of a source that holds one video. UserError if it holds several."""
-    motion = next(each)
-    if next(each, None) is not None:
+    motion = next(videos)
+    if next(videos, None) is not None:
         raise UserError(f"source: {source} holds several sequences: give one of them")
     return motion
 
@@ -165,10 +165,10 @@ def _read_stored(sequence: Sequence, source: str) -> Motion:
         if source == "motion":
             deviations = sequence.read_sealed("motion_deviation")
         arrays = zip(sequence.read_sealed(FIELDS[source]), confidences, deviations, time_s, strict=True)
-        for t, (values, confidence, deviation, at) in enumerate(arrays):
-            motion = Moved(values, deviation) if has_depth(source) else None
+        for t, (values, confidence, deviation, seconds) in enumerate(arrays):
+            motion = Motion3D(values, deviation) if has_depth(source) else None
             flow = values if motion is None else np.asarray(values[..., :2] / scale, np.float32)
-            yield FrameMotion(flow, confidence, motion=motion, index=t, time_s=float(at))
+            yield FrameMotion(flow, confidence, motion=motion, index=t, time_s=float(seconds))
 
     return Motion(
         name=sequence.path.stem,
@@ -193,14 +193,14 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tissue = partial(video.read_mask, options.tissue)
     elif options.tissue is not None:
         tissue = partial(_mask, "tissue", options.tissue, 0)
-    taken: list[str] = [] if scale_known else [UNKNOWN_NOTE]
+    notes: list[str] = [] if scale_known else [UNKNOWN_NOTE]
     is_file = isinstance(source, Path) and not source.is_dir()
     if isinstance(source, Path) and not is_file and options.fps == video.FPS:
-        taken.append(f"the pictures have no times: {options.fps:g} per second are assumed")
+        notes.append(f"the pictures have no times: {options.fps:g} per second are assumed")
     tool: Callable[[int, Size], Mask | None] | None = None
     if isinstance(options.tool, MaskFiles):
         count = video.count_frames(path) if is_file else None
-        tool = options.tool.of_frames(range(count or 0), taken).read
+        tool = options.tool.of_frames(range(count or 0), notes).read
     elif options.tool is not None:
         tool = partial(_mask, "masks", options.tool)
     footage = Footage(
@@ -209,13 +209,13 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tissue,
         tool,
         options.rest_frame,
-        depth=_right(source, options, taken),
+        depth=_right(source, options, notes),
     )
     track = track_video(footage, options.settings, compare_cameras=footage.depth is not None)
     rest, findings = track.video.rest, [*track.video.findings]
     scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
     if track.pair is not None and (quality := track.pair.quality) is not None:
-        taken.append(quality.describe())
+        notes.append(quality.describe())
         findings += judge_pair(quality, scale)
     removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
     missing = [finding.message for finding in findings if finding.severity == "missing"]
@@ -227,7 +227,7 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         young_kpa=None,
         recovered_by=name_motion(options.settings.backend),
         shrink=rest.shrink,
-        notes=(*taken, *track.notes, *removed, *missing),
+        notes=(*notes, *track.notes, *removed, *missing),
         findings=(*judge_scale(scale, rest.size[1]), *findings),
         scale_known=scale_known,
     )
@@ -250,8 +250,8 @@ def _right(source: Path | Array, options: VideoOptions, notes: list[str]) -> Rig
     frame_of = file_numbers.match_numbers(_numbers(second.pictures), _numbers(source), "right", notes)
     return RightVideo(
         lambda: (
-            replace(one, index=frame_of.get(one.index, one.index))
-            for one in _pictures(second.pictures, options.fps)
+            replace(picture, index=frame_of.get(picture.index, picture.index))
+            for picture in _pictures(second.pictures, options.fps)
         ),
         lambda size: read_rig(second.calibration, size[::-1], second.mm_per_unit),
         scale,
@@ -267,10 +267,10 @@ def _numbers(source: Path | Array) -> Collection[int]:
     return range(video.count_frames(source) or 0)
 
 
-def _check_frames(what: str, frames: Array) -> None:
+def _check_frames(label: str, frames: Array) -> None:
     """UserError unless frames are (T, H, W, 3) uint8."""
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3:
-        raise UserError(f"{what}: {frames.dtype} {frames.shape}, expected uint8 (T, H, W, 3)")
+        raise UserError(f"{label}: {frames.dtype} {frames.shape}, expected uint8 (T, H, W, 3)")
 
 
 def _pictures(source: Path | Array, fps: float) -> Iterator[video.Picture]:
@@ -279,11 +279,11 @@ def _pictures(source: Path | Array, fps: float) -> Iterator[video.Picture]:
     return (video.Picture(t, t / fps, np.ascontiguousarray(rgb)) for t, rgb in enumerate(source))
 
 
-def _mask(what: str, given: Array, index: int, size: Size) -> Mask:
+def _mask(label: str, masks: Array, index: int, size: Size) -> Mask:
     """The mask of a frame, (H, W), from one for all or from (T, H, W)."""
-    if given.shape[-2:] != size or given.ndim not in (2, 3) or (given.ndim == 3 and index >= len(given)):
-        raise UserError(f"{what}: {given.shape}, but frame {index} of the video is {size}")
-    return np.asarray((given if given.ndim == 2 else given[index]) != 0)
+    if masks.shape[-2:] != size or masks.ndim not in (2, 3) or (masks.ndim == 3 and index >= len(masks)):
+        raise UserError(f"{label}: {masks.shape}, but frame {index} of the video is {size}")
+    return np.asarray((masks if masks.ndim == 2 else masks[index]) != 0)
 
 
 def _arrays(path: Path) -> Motion:
@@ -296,9 +296,9 @@ def _arrays(path: Path) -> Motion:
         raise UserError(f"{path}: {names[0]} holds no frames")
     if tissue.ndim != 2:
         raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
-    wanted = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
-    wanted |= {"confidence": (*count, *tissue.shape), "force_mn": count}
-    for name, shape in wanted.items():
+    shapes = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
+    shapes |= {"confidence": (*count, *tissue.shape), "force_mn": count}
+    for name, shape in shapes.items():
         if name in arrays and arrays[name].shape != shape:
             raise UserError(f"{path}: {name} is {arrays[name].shape}, expected {shape} like the tissue")
     scale, force = _positive(path, arrays, "scale_mm_per_px"), arrays.get("force_mn")
@@ -307,7 +307,7 @@ def _arrays(path: Path) -> Motion:
         confidence = arrays.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
         for t in range(count[0]):
             first, *rest = (arrays[name][t].astype(np.float32) for name in names)
-            motion = Moved(first, rest[0]) if rest else None
+            motion = Motion3D(first, rest[0]) if rest else None
             flow = first[..., :2] / scale if rest else first
             yield FrameMotion(flow, confidence[t].astype(np.float32), motion=motion, index=t)
 

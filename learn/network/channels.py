@@ -27,13 +27,13 @@ def channels(
     Returns (B, 5 to 9, N, N), dimensionless.
     Source: the five channels of Heraoui et al., here in mm and with one displacement scale.
     """
-    moved = displacement * mask / scales.displacement_mm
+    motion = displacement * mask / scales.displacement_mm
     # vector_norm takes ten times as long over so short an axis.
-    length = (moved[:, :1].square() + moved[:, 1:2].square()).sqrt()
-    parts = [moved[:, :2], length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
+    length = (motion[:, :1].square() + motion[:, 1:2].square()).sqrt()
+    parts = [motion[:, :2], length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
     if confidence is not None:
         parts.append(confidence[:, :1] * mask)
-    parts.append(moved[:, 2:])
+    parts.append(motion[:, 2:])
     if confidence is not None:
         parts.append(confidence[:, 1:] * mask)
     if membrane is not None:
@@ -70,10 +70,10 @@ def _difference(values: Tensor, mask: Tensor, dim: int) -> Tensor:
     """Mean of the forward and backward differences with both ends in the mask."""
     n = values.shape[dim]
     step = values.narrow(dim, 1, n - 1) - values.narrow(dim, 0, n - 1)
-    both = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
+    pair_mask = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
     ahead, behind = ((0, 1), (1, 0)) if dim == 3 else ((0, 0, 0, 1), (0, 0, 1, 0))
-    step = step * both
-    count = F.pad(both, ahead) + F.pad(both, behind)
+    step = step * pair_mask
+    count = F.pad(pair_mask, ahead) + F.pad(pair_mask, behind)
     return (F.pad(step, ahead) + F.pad(step, behind)) / count.clamp_min(1)
 
 
@@ -101,7 +101,7 @@ def _reach(sigma_px: float) -> int:
 @functools.lru_cache(maxsize=8)
 def _smoother(size: int, sigma_px: float) -> Tensor:
     """(N, N) symmetric matrix S, so that S u S is the Gaussian-smoothed u."""
-    away = (torch.arange(size)[:, None] - torch.arange(size)[None, :]).to(torch.float32)
-    weight = torch.exp(-0.5 * (away / max(sigma_px, 1e-3)) ** 2)
-    weight[away.abs() > _reach(sigma_px)] = 0
+    offsets = (torch.arange(size)[:, None] - torch.arange(size)[None, :]).to(torch.float32)
+    weight = torch.exp(-0.5 * (offsets / max(sigma_px, 1e-3)) ** 2)
+    weight[offsets.abs() > _reach(sigma_px)] = 0
     return weight / weight[size // 2].sum()

@@ -74,7 +74,7 @@ def load_network(name: str) -> Network:
 def build(name: str, shape: Shape) -> nn.Module:
     """The untrained network of a kind and shape. UserError for any exception of a plug-in."""
     kind = load_network(name)
-    if name in NETWORKS.own:
+    if name in NETWORKS.builtin:
         return kind.build(shape)
     with as_user_error(NETWORKS.label(name)):
         return kind.build(shape)

@@ -44,8 +44,8 @@ def solve(network: LinearMap, batches: Iterable[tuple[Tensor, Tensor]]) -> None:
     from sklearn.linear_model import Ridge  # of the extra `bench`
 
     pairs = [(network.pool(x[:, network.shape.axes]), network.pool(y)) for x, y in batches]
-    moved, force = (torch.cat(each).cpu().double().numpy() for each in zip(*pairs, strict=True))
-    penalty = network.shape.strength * float(np.square(moved).sum(0).mean())
-    fitted = Ridge(alpha=penalty, fit_intercept=False).fit(moved, force)
-    weight = torch.from_numpy(np.atleast_2d(fitted.coef_)).to(network.linear.weight)
+    motion, force = (torch.cat(parts).cpu().double().numpy() for parts in zip(*pairs, strict=True))
+    penalty = network.shape.strength * float(np.square(motion).sum(0).mean())
+    regression = Ridge(alpha=penalty, fit_intercept=False).fit(motion, force)
+    weight = torch.from_numpy(np.atleast_2d(regression.coef_)).to(network.linear.weight)
     network.linear.weight.copy_(weight)

@@ -34,8 +34,10 @@ class Batch(NamedTuple):
     def rotate(self, turn: int) -> Batch:
         """All fields turned by `rotate`; each confidence is a scalar."""
         planes = rotate(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
-        moved, mask, true = (rotate(field, turn) for field in (self.displacement, self.mask, self.target))
-        return Batch(moved, mask, planes, true, self.membrane)
+        displacement, mask, truth = (
+            rotate(field, turn) for field in (self.displacement, self.mask, self.target)
+        )
+        return Batch(displacement, mask, planes, truth, self.membrane)
 
 
 class FrameItem(NamedTuple):
@@ -52,17 +54,17 @@ class FrameItem(NamedTuple):
 
 def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
     """The batch with `surface_motion_mm` added to half of its frames; `generator`: always on the CPU."""
-    moved = batch.displacement
-    count, planes, size = moved.shape[0], moved.shape[1], moved.shape[-1]
+    displacement = batch.displacement
+    count, planes, size = displacement.shape[0], displacement.shape[1], displacement.shape[-1]
     axis = torch.linspace(-1, 1, size)
     x, y = axis.expand(size, size), axis[:, None].expand(size, size)
     shapes = torch.stack([torch.ones_like(x), x, y, 1 - x**2 - y**2])
     amount = torch.randn(count, planes, len(shapes), generator=generator)
-    along = torch.arange(planes) == 2
-    amount *= settings.surface_motion_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
+    is_depth = torch.arange(planes) == 2
+    amount *= settings.surface_motion_mm * torch.where(is_depth, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
     amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
-    added = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
-    return batch._replace(displacement=moved + added * batch.mask)
+    motion = torch.einsum("bps,syx->bpyx", amount, shapes).to(displacement)
+    return batch._replace(displacement=displacement + motion * batch.mask)
 
 
 def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
@@ -103,11 +105,16 @@ class FrameDataset:
             items = [items[i] for i in rng.choice(len(items), self.settings.epoch_frames, replace=False)]
         turn = rng.integers(0, 8, len(items))
         order = rng.permutation(len(items))
-        known = [False] * len(items)
+        membrane_known = [False] * len(items)
         if self.settings.arch.membrane:
-            known = [bool(is_known) for is_known in rng.random(len(items)) >= MEMBRANE_HIDDEN]
-        drawn = [FrameItem(items[i][0], items[i][1], self.sources[0], int(turn[i]), known[i]) for i in order]
-        return [self._with_errors(one, rng) for one in drawn] if len(self.sources) > 1 else drawn
+            membrane_known = [bool(is_known) for is_known in rng.random(len(items)) >= MEMBRANE_HIDDEN]
+        frame_items = [
+            FrameItem(items[i][0], items[i][1], self.sources[0], int(turn[i]), membrane_known[i])
+            for i in order
+        ]
+        if len(self.sources) > 1:
+            return [self._with_errors(item, rng) for item in frame_items]
+        return frame_items
 
     def _with_errors(self, item: FrameItem, rng: np.random.Generator) -> FrameItem:
         """The frame with true or recovered motion, another's error, or its own with another confidence."""
@@ -131,18 +138,20 @@ class FrameDataset:
     def batch(self, items: Sequence[FrameItem]) -> Batch:
         """The frames of `items` as tensors."""
         frames = []
-        for c, t, source, turn, known, errors, factor in items:
-            moved, confidence, true = self._read(c, t, source)
+        for c, t, source, turn, membrane_known, errors, factor in items:
+            displacement, confidence, truth = self._read(c, t, source)
             if errors is not None:
-                there = self._read(errors.clip, errors.frame, self.sources[-1])
+                donor_recovered = self._read(errors.clip, errors.frame, self.sources[-1])
                 donor = self._read(errors.clip, errors.frame, self.sources[0])[0]
-                moved, confidence = error_transfer.transfer(moved, donor, there[0] - donor, there[1], errors)
-                moved, confidence = moved * self._masks[c], confidence * self._masks[c]
+                displacement, confidence = error_transfer.transfer(
+                    displacement, donor, donor_recovered[0] - donor, donor_recovered[1], errors
+                )
+                displacement, confidence = displacement * self._masks[c], confidence * self._masks[c]
             if factor != 1:
                 confidence = error_transfer.restate(confidence, factor)
-            code = membrane_code(self.clips[c].membrane) if known else 0.0
+            code = membrane_code(self.clips[c].membrane) if membrane_known else 0.0
             codes = torch.full((1,), code, device=self.device)
-            frames.append(Batch(moved, self._masks[c], confidence, true, codes).rotate(turn))
+            frames.append(Batch(displacement, self._masks[c], confidence, truth, codes).rotate(turn))
         return Batch(*map(torch.cat, zip(*frames, strict=True)))
 
     def _read(self, c: int, t: int, source: str) -> tuple[Tensor, ...]:
@@ -159,7 +168,7 @@ class FrameDataset:
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:
     """Scales from up to `frames` evenly spaced frames of every clip. UserError: no motion or no force."""
-    moved, strain, wanted, force = [], [], [], []
+    motion, strain, target_sizes, force = [], [], [], []
     squares, cells = 0.0, 0.0
     for clip in clips:
         mask = torch.from_numpy(np.array(clip.mask))[None, None]
@@ -167,15 +176,17 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
         for t in np.unique(np.linspace(0, clip.frames - 1, frames).astype(int)):
             for source in (name for name in sources(settings.input) if name in clip.displacement):
                 u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
-                moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
+                motion.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
                 strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))
             truth = target(clip, int(t), settings.arch.components)
-            wanted.append(np.linalg.norm(truth, axis=0)[inside])
+            target_sizes.append(np.linalg.norm(truth, axis=0)[inside])
             squares += float(np.square(truth[:, inside], dtype=np.float64).sum())
             cells += float(inside.sum() * len(truth))
         total = amount(clip, settings.arch.components, settings.grid.pitch_mm)
         force.append(np.linalg.norm(total, axis=1))
-    scales = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
+    scales = tuple(
+        float(np.percentile(np.concatenate(v), 99.9)) for v in (motion, strain, target_sizes, force)
+    )
     if min(scales) <= 0:
         raise UserError("the training sequences have no motion or no force")
     return Scales(scales[0], scales[1], scales[2], scales[3], (squares / cells) ** 0.5)

@@ -65,16 +65,16 @@ def transfer(
     _, donor_size = _contact(donor_true)
     likeness, turn, shift, scale = 0.0, 0, (0, 0), 1.0
     if min(size, donor_size) < _LEAST_MM:
-        far = donor_true.norm(dim=1, keepdim=True) <= max(_FAR * donor_size, _LEAST_MM)
-        error, confidence = error * far, torch.where(far, confidence, 1.0)
+        is_far = donor_true.norm(dim=1, keepdim=True) <= max(_FAR * donor_size, _LEAST_MM)
+        error, confidence = error * is_far, torch.where(is_far, confidence, 1.0)
     else:
         for trial in range(8):
-            there = rotate(donor_true, trial)
-            row, column = _contact(there)[0]
-            moved = place[0] - row, place[1] - column
-            alike = float((_shift(there, moved) * true).sum())
-            if abs(alike) > abs(likeness):
-                likeness, turn, shift = alike, trial, moved
+            rotated = rotate(donor_true, trial)
+            row, column = _contact(rotated)[0]
+            offset = place[0] - row, place[1] - column
+            similarity = float((_shift(rotated, offset) * true).sum())
+            if abs(similarity) > abs(likeness):
+                likeness, turn, shift = similarity, trial, offset
         scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
     factor = scale * error.new_tensor(transfer.factor).view(1, -1, 1, 1)
     planes = rotate(confidence.transpose(0, 1), turn).transpose(0, 1)
@@ -84,8 +84,8 @@ def transfer(
 def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:
     """Row and column of the largest motion, and its size [mm]."""
     size = motion.square().sum(1)[0]
-    at = int(size.argmax())
-    return divmod(at, size.shape[1]), float(size.flatten()[at].sqrt())
+    index = int(size.argmax())
+    return divmod(index, size.shape[1]), float(size.flatten()[index].sqrt())
 
 
 def _shift(values: Tensor, shift: tuple[int, int]) -> Tensor:

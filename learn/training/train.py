@@ -58,7 +58,7 @@ def train(
 
     The stored epoch, the last with `cosine`, the best with `plateau`, is also written as ONNX, by which it is
     used. Returns its card. Raises UserError if
-    `out` holds another run, on divergence, and for a `start` that `_begun` refuses.
+    `out` holds another run, on divergence, and for a `start` that `_begin_card` refuses.
     """
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = start[1].scales if start else measure_scales(fit, settings)
@@ -68,7 +68,7 @@ def train(
     motion = sorted({*recovered} - {""})
     parts = name_parts(clips, split)
     card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)
-    card = _begun(card, start[1]) if start else card
+    card = _begin_card(card, start[1]) if start else card
     state = _open(out, card)
     try:
         run = _start(card, state, torch.device(device), start and start[0])
@@ -83,8 +83,8 @@ def train(
                 _write_numbers(out / "history.jsonl", board, epoch, numbers)
                 if improved:
                     gain = numbers["select_gain"]
-                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
-                    checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
+                    epoch_card = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
+                    checkpoint.write_model(out, epoch_card, _cpu(run.model.state_dict()))
                 checkpoint.save_tensors(out / "last.pt", run.as_dict())
                 log(numbers)
     except (UserError, OSError):
@@ -97,26 +97,28 @@ def train(
     return card
 
 
-def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
+def _begin_card(card: ModelCard, start: ModelCard) -> ModelCard:
     """The card of a training that begins with the weights of a model with the card `start`.
 
     UserError if that is of another architecture, grid or unit of the split, or was trained on brains of the
     select, interval or test part.
     """
     shapes = [
-        (each.settings.network, each.settings.arch.model_dump(exclude={"dropout"}), each.settings.grid)
-        for each in (card, start)
+        (settings.network, settings.arch.model_dump(exclude={"dropout"}), settings.grid)
+        for settings in (card.settings, start.settings)
     ]
     if shapes[0] != shapes[1]:
         raise UserError("start: a model of another architecture or grid")
     if find_unit(card) != find_unit(start):
         raise UserError("start: its data were split by another unit (anatomy, opening or sequence)")
-    for known, new in ((start.split, card.split), (start.groups, card.groups)):
-        barred = {"select": ("fit", "start"), "intervals": ("fit", "select", "start"), "test": USED}
-        for part, used in barred.items():
-            if {group for name in used for group in known.get(name, ())}.intersection(new.get(part, ())):
+    for start_parts, new_parts in ((start.split, card.split), (start.groups, card.groups)):
+        barred_parts = {"select": ("fit", "start"), "intervals": ("fit", "select", "start"), "test": USED}
+        for part, used_parts in barred_parts.items():
+            if {group for name in used_parts for group in start_parts.get(name, ())}.intersection(
+                new_parts.get(part, ())
+            ):
                 raise UserError(f"start: was trained on brains of this data's {part} part")
-        new["start"] = sorted({group for name in USED for group in known.get(name, ())})
+        new_parts["start"] = sorted({group for name in USED for group in start_parts.get(name, ())})
     return dataclasses.replace(card, motion=sorted({*card.motion, *start.motion}))
 
 
@@ -146,8 +148,8 @@ class _Run:
             self.plateau.step(score)
         # No epoch before the loss has its full penalty on off-target force. With `cosine` the last one: the
         # best on the select side erred half as much again on other mechanics (design.md).
-        chosen = score > (-math.inf if settings.schedule == "cosine" else self.best)
-        improved = is_full(settings.loss, self.epoch / settings.epochs) and chosen
+        is_better = score > (-math.inf if settings.schedule == "cosine" else self.best)
+        improved = is_full(settings.loss, self.epoch / settings.epochs) and is_better
         self.best = score if improved else self.best
         return improved
 
@@ -195,8 +197,8 @@ def _epoch(
     batches = max(len(order) // settings.batch, 1)
     if (solve := load_network(settings.network).solve) is not None:
         parts = (order[i * settings.batch : (i + 1) * settings.batch] for i in range(batches))
-        read = (_augment(frames.batch(part), settings, epoch, i) for i, part in enumerate(parts))
-        solve(net, ((inputs(each, settings, scales), each.target / scales.target) for each in read))
+        augmented = (_augment(frames.batch(part), settings, epoch, i) for i, part in enumerate(parts))
+        solve(net, ((inputs(batch, settings, scales), batch.target / scales.target) for batch in augmented))
     net.train(solve is None)
     total = torch.zeros((), device=frames.device)
     constants = scales.target, scales.spread, scales.force / settings.grid.pitch_mm**2
@@ -260,9 +262,9 @@ def select_score(net: torch.nn.Module, frames: FrameDataset, scales: Scales) -> 
     sums, forces = np.zeros(7), list[tuple[Floats, Floats]]()
     for c in range(len(frames.clips)):
         true, predicted = list[Floats](), list[Floats]()
-        for here in frames.sequential(c, frames.sources[-1]):
-            inside = here.mask.bool().expand_as(here.target)
-            pair = here.target, forward(net, here, frames.settings, scales)
+        for batch in frames.sequential(c, frames.sources[-1]):
+            inside = batch.mask.bool().expand_as(batch.target)
+            pair = batch.target, forward(net, batch, frames.settings, scales)
             sums = sums + moments(*(maps[inside].cpu().numpy() for maps in pair))
             for totals, maps in zip((true, predicted), pair, strict=True):
                 totals.append((maps * inside).sum((2, 3)).cpu().double().numpy())
@@ -285,10 +287,10 @@ def _gain(forces: Sequence[tuple[Floats, Floats]], anatomies: int) -> float:
     ratios, weights = [], []
     for true, predicted in forces:
         size, mean = np.linalg.norm(predicted, axis=1), np.linalg.norm(true, axis=1).sum()
-        told = size > 0
-        if mean > 0 and told.any():
-            ratios.append(((true * predicted).sum(1)[told]) / size[told] ** 2)
-            weights.append(size[told] / mean)
+        is_nonzero = size > 0
+        if mean > 0 and is_nonzero.any():
+            ratios.append(((true * predicted).sum(1)[is_nonzero]) / size[is_nonzero] ** 2)
+            weights.append(size[is_nonzero] / mean)
     if anatomies < _GAIN_ANATOMIES or not ratios:
         return 1.0
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
@@ -302,14 +304,14 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     if not out.exists() or (out.is_dir() and all(path.name.startswith(".") for path in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
-    there = checkpoint.read_card(out)
-    if there.settings != replace(card.settings, epochs=there.settings.epochs):
+    stored = checkpoint.read_card(out)
+    if stored.settings != replace(card.settings, epochs=stored.settings.epochs):
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
-    if there.split != card.split or there.scales != card.scales:
+    if stored.split != card.split or stored.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    bound = not is_full(there.settings.loss, 0.0) or there.settings.schedule == "cosine"
-    if there.settings.epochs != card.settings.epochs and bound:
-        raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
+    is_schedule_fixed = not is_full(stored.settings.loss, 0.0) or stored.settings.schedule == "cosine"
+    if stored.settings.epochs != card.settings.epochs and is_schedule_fixed:
+        raise UserError(f"{out}: its schedule is for {stored.settings.epochs} epochs; don't change --epochs")
     return checkpoint.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None
 
 

@@ -34,7 +34,7 @@ def quantile(scores: Sequence[Floats], level: float) -> float:
 def weighted_quantile(units: Sequence[Floats], weight: float, share: float) -> float:
     """Value at which the summed weights, `weight` per unit (n,), reach `share`; infinity if they don't."""
     values = np.concatenate(units)
-    each = np.concatenate([np.full(len(unit), weight / len(unit)) for unit in units])
+    weights = np.concatenate([np.full(len(unit), weight / len(unit)) for unit in units])
     order = np.argsort(values, kind="stable")
-    reached = np.cumsum(each[order]) >= share - 1e-9
-    return float(values[order[np.argmax(reached)]]) if reached.any() else math.inf
+    is_reached = np.cumsum(weights[order]) >= share - 1e-9
+    return float(values[order[np.argmax(is_reached)]]) if is_reached.any() else math.inf

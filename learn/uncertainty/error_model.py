@@ -36,11 +36,11 @@ def fit_error_model(
     `ridge`: number of frames as which the prior counts that a feature has no effect.
     """
     spread = np.maximum(features.std(0), 1e-6)
-    wanted, share = np.log(error + least), weight / weight.mean()
-    middle, level = np.average(features, 0, share), float(np.average(wanted, weights=share))
+    log_error, share = np.log(error + least), weight / weight.mean()
+    middle, level = np.average(features, 0, share), float(np.average(log_error, weights=share))
     scaled = (features - middle) / spread
     normal = scaled.T @ (share[:, None] * scaled) + ridge * np.eye(scaled.shape[1])
-    slopes = np.linalg.solve(normal, scaled.T @ (share * (wanted - level))) / spread
+    slopes = np.linalg.solve(normal, scaled.T @ (share * (log_error - level))) / spread
     ends = slopes, features.min(0), features.max(0)
     per_feature, low, high = (tuple(end.tolist()) for end in ends)
     return ErrorModel(level - float(middle @ slopes), per_feature, low, high, least)

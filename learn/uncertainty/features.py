@@ -32,11 +32,11 @@ def motion_features(displacement: Map, mask: Map, confidence: Map | None, extent
     inside = mask > 0
     shift, weight = _coarse(displacement * inside, inside)
     # If the tissue is smaller than a block: the blocks that hold most of it.
-    here = weight > (0.5 if (weight > 0.5).any() else 0.99 * weight.max())
-    u = np.moveaxis(shift, 1, -1)[:, here].astype(np.float64)
+    is_tissue = weight > (0.5 if (weight > 0.5).any() else 0.99 * weight.max())
+    u = np.moveaxis(shift, 1, -1)[:, is_tissue].astype(np.float64)
     squared = np.square(u[..., :2]).sum(-1)
     motion = np.sqrt(squared.mean(1))
-    stretch = _REACH_MM * _divergence(shift[:, :2], here, extent_mm / weight.shape[0])
+    stretch = _REACH_MM * _divergence(shift[:, :2], is_tissue, extent_mm / weight.shape[0])
     means = np.ones((len(u), displacement.shape[1] - 1))  # of the confidence over the tissue
     if confidence is not None:
         means = np.asarray(confidence[..., inside].mean(-1, dtype=np.float64))
@@ -86,11 +86,11 @@ def _coarse(values: Map, inside: Mask) -> tuple[Floats, Floats]:
     return pool(values) / np.where(share > 0, share, 1.0), share
 
 
-def _divergence(shift: Floats, here: Mask, pitch_mm: float) -> Floats:
+def _divergence(shift: Floats, is_tissue: Mask, pitch_mm: float) -> Floats:
     """(T,) root mean square of the divergence of (T, 2, n, n), by forward differences in the tissue."""
-    ends = here[:-1, :-1] & here[:-1, 1:] & here[1:, :-1]
-    if not ends.any():
+    is_inside = is_tissue[:-1, :-1] & is_tissue[:-1, 1:] & is_tissue[1:, :-1]
+    if not is_inside.any():
         return np.zeros(len(shift))
-    across = np.diff(shift[:, 0], axis=2)[:, :-1][:, ends]
-    down = np.diff(shift[:, 1], axis=1)[:, :, :-1][:, ends]
+    across = np.diff(shift[:, 0], axis=2)[:, :-1][:, is_inside]
+    down = np.diff(shift[:, 1], axis=1)[:, :, :-1][:, is_inside]
     return np.asarray(np.sqrt(np.square((across + down) / pitch_mm).mean(1)))

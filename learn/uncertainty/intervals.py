@@ -114,9 +114,9 @@ class Intervals:
     def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:
         """Intervals of the frames' forces at a level of `LEVELS`, per unit stiffness."""
         features = frame_features(predicted, self.force_unit)
-        wide = _widen(self.distribution, self.size.scale, predicted.motion, features)
-        half = wide * self.size.half(features, level)
-        axes = np.stack([wide * one.half(features, level) for one in self.axes], axis=1)
+        widening = _widen(self.distribution, self.size.scale, predicted.motion, features)
+        half = widening * self.size.half(features, level)
+        axes = np.stack([widening * spread.half(features, level) for spread in self.axes], axis=1)
         low = np.maximum(predicted.size - half, 0.0)
         return Band(low, predicted.size + half, predicted.centre - axes, predicted.centre + axes)
 
@@ -129,8 +129,8 @@ def frame_features(predicted: Prediction, force_unit: float) -> Floats:
 
 def make_example(predicted: Prediction, true: Floats, unit: int, force_unit: float) -> Example:
     """A sequence's errors. `true`: (T, 3) force per unit stiffness; `force_unit`: as of `Intervals`."""
-    off = np.abs(np.linalg.norm(true, axis=1) - predicted.size)
-    error = np.column_stack([off, np.abs(true - predicted.centre)])
+    size_error = np.abs(np.linalg.norm(true, axis=1) - predicted.size)
+    error = np.column_stack([size_error, np.abs(true - predicted.centre)])
     return Example(unit, predicted.motion, frame_features(predicted, force_unit), error)
 
 
@@ -146,27 +146,27 @@ def fit(
 
     The two and the training sequences must not share units. UserError for too few of `calibration`.
     """
-    count, least = len({one.unit for one in calibration}), conformal.least_units(LEVELS[0])
+    count, least = len({example.unit for example in calibration}), conformal.least_units(LEVELS[0])
     if count < least:
         raise UserError(f"{count} brains are left for intervals; {LEVELS[0]:.0%} needs {least}")
-    features = np.concatenate([one.features for one in selection])
-    error = np.concatenate([one.error for one in selection])
-    weight = np.concatenate([np.full(n, 1 / n) for n in (len(one.features) for one in selection)])
+    features = np.concatenate([example.features for example in selection])
+    error = np.concatenate([example.error for example in selection])
+    weight = np.concatenate([np.full(n, 1 / n) for n in (len(example.features) for example in selection)])
     models = [fit_error_model(features, e, weight, _LEAST * force_unit) for e in error.T]
-    wide = [_widen(distribution, models[0], one.motion, one.features) for one in calibration]
+    widenings = [_widen(distribution, models[0], example.motion, example.features) for example in calibration]
 
     def spread(k: int) -> Spread:
         """Of the size (0) or of a component (1 to 3)."""
         by_unit: dict[int, list[Floats]] = {}
-        for one, w in zip(calibration, wide, strict=True):
-            error = one.error[:, k] / (w * models[k].predict(one.features))
-            by_unit.setdefault(one.unit, []).append(error)
+        for example, w in zip(calibration, widenings, strict=True):
+            error = example.error[:, k] / (w * models[k].predict(example.features))
+            by_unit.setdefault(example.unit, []).append(error)
         scores = [np.concatenate(errors) for errors in by_unit.values()]
         factors = {str(level): max(conformal.quantile(scores, level), 1e-9) for level in LEVELS}
         return Spread(models[k], factors)
 
-    size, axes, known = spread(0), (spread(1), spread(2), spread(3)), (*names, *ESTIMATE)
-    return Intervals(known, force_unit, size, axes, distribution, source, count, len(calibration))
+    size, axes, feature_names = spread(0), (spread(1), spread(2), spread(3)), (*names, *ESTIMATE)
+    return Intervals(feature_names, force_unit, size, axes, distribution, source, count, len(calibration))
 
 
 def _widen(distribution: MotionDistribution, size: ErrorModel, motion: Floats, features: Floats) -> Floats:

@@ -31,8 +31,8 @@ class MotionDistribution:
 
     def distance(self, motion: Floats) -> Floats:
         """(T,) Mahalanobis distance of frames (T, F) of `motion_features`; 0 for frames at rest."""
-        off = motion - np.array(self.mean)
-        squared = np.einsum("ti,ij,tj->t", off, np.array(self.precision), off)
+        deviation = motion - np.array(self.mean)
+        squared = np.einsum("ti,ij,tj->t", deviation, np.array(self.precision), deviation)
         return np.where(is_moving(motion), np.sqrt(np.maximum(squared, 0)), 0.0)
 
     def relative_distance(self, motion: Floats) -> Floats:
@@ -41,15 +41,19 @@ class MotionDistribution:
 
     def recording_distance(self, motion: Floats) -> float:
         """`relative_distance` that a tenth of a recording's moving frames exceed; 0 if none moves."""
-        moved = self.relative_distance(motion)[is_moving(motion)]
-        return float(np.quantile(moved, _QUANTILE)) if len(moved) else 0.0
+        distances = self.relative_distance(motion)[is_moving(motion)]
+        return float(np.quantile(distances, _QUANTILE)) if len(distances) else 0.0
 
-    def calibrated(self, recordings: Sequence[Floats]) -> MotionDistribution:
+    def calibrate(self, recordings: Sequence[Floats]) -> MotionDistribution:
         """A copy with `recording_limit` from `motion_features` (T, F) of held-out recordings: with fewer than
         19 moving ones the largest of their distances."""
-        far = [np.array([self.recording_distance(one)]) for one in recordings if is_moving(one).any()]
-        limit = quantile(far, RECORDINGS)
-        return replace(self, recording_limit=max(limit if np.isfinite(limit) else np.max(far), 1e-6))
+        distances = [
+            np.array([self.recording_distance(recording)])
+            for recording in recordings
+            if is_moving(recording).any()
+        ]
+        limit = quantile(distances, RECORDINGS)
+        return replace(self, recording_limit=max(limit if np.isfinite(limit) else np.max(distances), 1e-6))
 
 
 def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> MotionDistribution | None:
@@ -57,21 +61,23 @@ def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> Mo
 
     `fitted`, `held_out`: `motion_features` (T, F) of each training sequence and of each other one.
     """
-    moved = [motion[is_moving(motion)] for motion in fitted]
+    moving_frames = [motion[is_moving(motion)] for motion in fitted]
     others = [motion for motion in held_out if is_moving(motion).any()]
-    if sum(map(len, moved)) < 2 or not others:
+    if sum(map(len, moving_frames)) < 2 or not others:
         return None
-    frames = np.concatenate(moved)
+    frames = np.concatenate(moving_frames)
     spread = np.maximum(frames.std(0), _LEAST_SPREAD)
     shrunk = shrunk_covariance(frames / spread)
     # A least variance for features that don't vary, so that the covariance can be inverted.
     least = (_LEAST_SPREAD / spread) ** 2
     precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
     precision = precision / np.outer(spread, spread)
-    found = MotionDistribution(tuple(frames.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
-    far = [found.distance(one)[is_moving(one)] for one in others]
-    limit = weighted_quantile(far, 1.0, FRAMES * len(far))
-    return replace(found, frame_limit=max(limit, 1e-6))
+    distribution = MotionDistribution(
+        tuple(frames.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0
+    )
+    distances = [distribution.distance(motion)[is_moving(motion)] for motion in others]
+    limit = weighted_quantile(distances, 1.0, FRAMES * len(distances))
+    return replace(distribution, frame_limit=max(limit, 1e-6))
 
 
 def shrunk_covariance(samples: Floats) -> Floats:
@@ -81,9 +87,9 @@ def shrunk_covariance(samples: Floats) -> Floats:
     centred = samples - samples.mean(0)
     plain = centred.T @ centred / count
     mean = np.trace(plain) / parts
-    away = float(((plain - mean * np.eye(parts)) ** 2).sum())
+    dispersion = float(((plain - mean * np.eye(parts)) ** 2).sum())
     noise = float(((centred**2).sum(1) ** 2).mean() - (plain**2).sum()) / count
-    share = min(noise / away, 1.0) if away > 0 else 0.0
+    share = min(noise / dispersion, 1.0) if dispersion > 0 else 0.0
     return np.asarray((1 - share) * plain + share * mean * np.eye(parts))
 
 
@@ -92,17 +98,17 @@ def describe_out_of_distribution(
 ) -> list[str]:
     """A warning if a recording, by the features (T, F) of its tracked frames, is further from the training
     data than 95% of held-out ones, else none."""
-    far = distribution.recording_distance(motion)
-    if not far > distribution.recording_limit:
+    distance = distribution.recording_distance(motion)
+    if not distance > distribution.recording_limit:
         return []
-    off = motion[distribution.relative_distance(motion) >= far] - np.array(distribution.mean)
-    parts = (off * (off @ np.array(distribution.precision))).mean(0)
+    deviation = motion[distribution.relative_distance(motion) >= distance] - np.array(distribution.mean)
+    parts = (deviation * (deviation @ np.array(distribution.precision))).mean(0)
     # The features with the largest parts in the squared distance, which together are half of it.
     order = np.argsort(-parts)
-    most = order[: 1 + int(np.argmax(np.cumsum(parts[order]) >= parts.sum() / 2))]
-    named = " and ".join(f"{names[k]} ({'high' if off[:, k].mean() > 0 else 'low'})" for k in most)
+    largest = order[: 1 + int(np.argmax(np.cumsum(parts[order]) >= parts.sum() / 2))]
+    causes = " and ".join(f"{names[k]} ({'high' if deviation[:, k].mean() > 0 else 'low'})" for k in largest)
     return [
-        f"{OUT_OF_DISTRIBUTION}: the motion differs from the training data's, most in {named}; its distance "
-        f"is {far / distribution.recording_limit:.2g} times that of 95% of recordings at most; intervals are "
-        "widened and may still be too narrow"
+        f"{OUT_OF_DISTRIBUTION}: the motion differs from the training data's, most in {causes}; its distance "
+        f"is {distance / distribution.recording_limit:.2g} times that of 95% of recordings at most; "
+        "intervals are widened and may still be too narrow"
     ]

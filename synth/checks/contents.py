@@ -30,10 +30,10 @@ def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """The fields are as declared in the field table: shape, type, unit, meaning, axes."""
     for field in FIELDS.values():
         if field.name in sequence:
-            found = sequence[field.name]
-            known = {"unit": field.unit, "meaning": field.meaning}
-            yield truth(found.attrs == known, f"{field.name}: unit or meaning was edited")
-            yield truth(found.dims == field.dims, f"{field.name}: axes were edited")
+            reader = sequence[field.name]
+            expected = {"unit": field.unit, "meaning": field.meaning}
+            yield truth(reader.attrs == expected, f"{field.name}: unit or meaning was edited")
+            yield truth(reader.dims == field.dims, f"{field.name}: axes were edited")
         else:
             yield truth(field.stored != "always", f"{field.name} is missing")
 
@@ -46,24 +46,24 @@ def check_values(
     `fast`: no checksums, and only `frames` of large fields. UserError if a chunk cannot be read.
     """
     for name in sequence.fields:
-        field, found = FIELDS[name], sequence[name]
-        hasher = None if fast else store.field_hasher(name, found.stored, found.shape)
+        field, reader = FIELDS[name], sequence[name]
+        hasher = None if fast else store.field_hasher(name, reader.stored, reader.shape)
         low, high, finite = np.inf, -np.inf, True
-        every: Any = (frames if fast else range(len(found))) if field.framed else [...]
-        for part in every:
+        selections: Any = (frames if fast else range(len(reader))) if field.framed else [...]
+        for selection in selections:
             with watch.stage("readable"):
-                values = np.ascontiguousarray(found[part])
+                values = np.ascontiguousarray(reader[selection])
             if hasher is not None:
                 with watch.stage("checksum"):
-                    hasher.update(values.astype(found.stored, copy=False).data)
+                    hasher.update(values.astype(reader.stored, copy=False).data)
             if values.dtype.kind == "f":
                 with watch.stage("finite"):
                     finite = finite and bool(np.isfinite(values).all())
                 with watch.stage("range"):
                     low, high = min(low, float(values.min())), max(high, float(values.max()))
         if hasher is not None:
-            good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
-            yield "checksum", truth(good, f"{name}: values were changed")
+            unchanged = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
+            yield "checksum", truth(unchanged, f"{name}: values were changed")
         yield "finite", truth(finite, f"{name}: contains values that are not finite")
         if finite and field.low is not None:
             yield "range", Measure(field.low - low, 0.0, f"{name}: smallest value {low:g}", field.unit)

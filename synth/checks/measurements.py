@@ -18,7 +18,7 @@ class Measure:
 
     value: float
     limit: float
-    where: str
+    place: str
     unit: str = "-"  # of value and limit
 
     @property
@@ -44,9 +44,9 @@ Invariant = Callable[[Sequence, list[int]], Iterator[Measure | Nothing]]
 """Measures of a sequence in some frames, or the reason why there is none."""
 
 
-def truth(good: bool, where: str) -> Measure:
+def truth(good: bool, place: str) -> Measure:
     """A measure of a condition that holds or not."""
-    return Measure(0.0 if good else 1.0, 0.0, where)
+    return Measure(0.0 if good else 1.0, 0.0, place)
 
 
 def inner(mask: Mask, pixels: int) -> Mask:

@@ -22,13 +22,13 @@ def picture(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     tissue = sequence["tissue"][:]
     yield truth(bool(tissue.any()), "no tissue in view")
     for t in frames:
-        shown = {"tissue": sequence["rgb"][t][tissue & ~sequence["tool"][t]]}
+        regions = {"tissue": sequence["rgb"][t][tissue & ~sequence["tool"][t]]}
         if "rgb_right" in sequence:
-            shown["right picture"] = sequence["rgb_right"][t]
-        for what, pixels in shown.items():
+            regions["right picture"] = sequence["rgb_right"][t]
+        for region, pixels in regions.items():
             if len(pixels):
                 blank = blank_share(pixels)
-                yield Measure(blank, MOST_BLANK, f"frame {t}: {what} black or burnt out")
+                yield Measure(blank, MOST_BLANK, f"frame {t}: {region} black or burnt out")
 
 
 def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
@@ -38,19 +38,19 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]
         return
     view, (height, width) = camera_of(sequence), sequence.size
     depth = sequence["depth"][0].astype(np.float64)
-    on = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
-    core = inner(on, 4)
+    tissue = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
+    core = inner(tissue, 4)
     if not core.any():
         yield Nothing("no tissue wider than 8 px in view")
         return
     points = cameras.rays(view, cameras.pixel_grid(view.size)).reshape(height, width, 3) * depth[..., None]
     across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
-    spanned = np.linalg.norm(np.cross(across, down), axis=-1)
-    inside = core[1:-1, 1:-1]
-    area = np.maximum(sequence["area"][:][1:-1, 1:-1][inside], 1e-12)
-    off = np.abs(spanned[inside] / area - 1)
-    yield Measure(float(np.median(off)), 0.02, "area of the median pixel")
-    yield Measure(float(np.quantile(off, 0.9)), 0.3, "area of 90% of the pixels")
+    spanned_area = np.linalg.norm(np.cross(across, down), axis=-1)
+    interior = core[1:-1, 1:-1]
+    area = np.maximum(sequence["area"][:][1:-1, 1:-1][interior], 1e-12)
+    error = np.abs(spanned_area[interior] / area - 1)
+    yield Measure(float(np.median(error)), 0.02, "area of the median pixel")
+    yield Measure(float(np.quantile(error, 0.9)), 0.3, "area of 90% of the pixels")
     scale = float(np.median(depth[core])) / float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
     yield Measure(abs(scale / view.mm_per_px - 1), 0.08, "scale")
 
@@ -64,10 +64,10 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing
     if "force" not in sequence or not sequence.attrs["scenario"]["gestures"]:
         yield Nothing("another program's instrument")
         return
-    at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
+    rest_camera, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     gesture = sequence.attrs["scenario"]["gestures"][0]
     # A reaction isn't even over the contact as a given pressure is: its centre is ahead of the middle.
-    near = (0.25 if gesture.get("drive") else 0.1) * float(gesture["footprint_mm"])
+    tolerance_mm = (0.25 if gesture.get("drive") else 0.1) * float(gesture["footprint_mm"])
     poses = camera_poses(sequence)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
@@ -81,10 +81,10 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing
         share = share / share.sum()
         flow = sequence["flow"][t]
         x, y = ((share * (base + flow[..., k])).sum() for k, base in enumerate((columns, rows)))
-        view = replace(at_rest, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
+        view = replace(rest_camera, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
         tip = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
-        off = float(np.hypot(x - tip[0], y - tip[1])) * view.mm_per_px
-        yield Measure(off, near + view.mm_per_px, f"frame {t}", "mm")
+        error_mm = float(np.hypot(x - tip[0], y - tip[1])) * view.mm_per_px
+        yield Measure(error_mm, tolerance_mm + view.mm_per_px, f"frame {t}", "mm")
 
 
 def camera_poses(sequence: Sequence) -> Floats:
@@ -92,12 +92,12 @@ def camera_poses(sequence: Sequence) -> Floats:
     Raises UserError if they are not stored and the motion is not one of ours."""
     if "camera" in sequence:
         return np.asarray(sequence["camera"][:])
-    at_rest, moves = camera_of(sequence), (sequence.attrs.get("scenario") or {}).get("camera_motion")
+    rest_camera, parameters = camera_of(sequence), (sequence.attrs.get("scenario") or {}).get("camera_motion")
     try:
-        motion = CameraMotion(**moves) if moves else None
+        motion = CameraMotion(**parameters) if parameters else None
     except TypeError:
         raise UserError(f"{sequence.path}: its camera moves; store.extra=[camera] stores how") from None
-    views = [motion.at(at_rest, float(t)) if motion else at_rest for t in sequence["time"][:]]
+    views = [motion.at(rest_camera, float(t)) if motion else rest_camera for t in sequence["time"][:]]
     return np.stack([view.pose for view in views])
 
 
@@ -105,6 +105,6 @@ def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> came
     """The camera of a sequence, or that of another `lens` in its attributes, without aperture and focus."""
     lens, (height, width) = lens or sequence.attrs, sequence.size
     names = ("K", "distortion", "rotation", "translation")
-    given = {name: np.asarray(lens[name], np.float64) for name in names}
+    arrays = {name: np.asarray(lens[name], np.float64) for name in names}
     scale = float(sequence.attrs["scale_mm_per_px"])
-    return cameras.Camera(**given, size=(width, height), aperture_mm=0.0, focus_mm=0.0, mm_per_px=scale)
+    return cameras.Camera(**arrays, size=(width, height), aperture_mm=0.0, focus_mm=0.0, mm_per_px=scale)

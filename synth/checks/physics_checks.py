@@ -21,14 +21,14 @@ def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """Frame 0 is at rest: no true or recovered motion [px], no force [mN], no load [kPa]."""
     yield Measure(float(np.abs(sequence["flow"][0]).max()), 0.02, "flow in frame 0", "px")
     if "flow_recovered" in sequence:
-        most = float(np.abs(sequence["flow_recovered"][0]).max())
-        yield Measure(most, 0.02, "recovered flow in frame 0", "px")
+        largest = float(np.abs(sequence["flow_recovered"][0]).max())
+        yield Measure(largest, 0.02, "recovered flow in frame 0", "px")
     if "force" not in sequence:
         return
     force = np.linalg.norm(sequence["force"][:], axis=1)
     yield Measure(float(force[0]), 1e-6 * max(float(force.max()), 1e-9), "force in frame 0", "mN")
-    least, most = (float(np.abs(sequence["traction"][t]).max()) for t in (0, int(np.argmax(force))))
-    yield Measure(least, 1e-6 * max(most, 1e-9), "traction in frame 0", "kPa")
+    smallest, largest = (float(np.abs(sequence["traction"][t]).max()) for t in (0, int(np.argmax(force))))
+    yield Measure(smallest, 1e-6 * max(largest, 1e-9), "traction in frame 0", "kPa")
 
 
 def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
@@ -38,24 +38,24 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     if "force" not in sequence:
         yield Nothing("another program's motion without a force")
         return
-    applied = sequence["force"][:]
-    shown, whole = np.zeros_like(applied), np.ones(len(applied), bool)
-    if "force_of" in sequence and applied.any():
-        off = np.abs(sequence["force_of"][:].sum(axis=1) - applied).max()
-        yield Measure(float(off / np.abs(applied).max()), 1e-6, "sum of the instruments")
+    total_force = sequence["force"][:]
+    pixel_force, in_view = np.zeros_like(total_force), np.ones(len(total_force), bool)
+    if "force_of" in sequence and total_force.any():
+        error = np.abs(sequence["force_of"][:].sum(axis=1) - total_force).max()
+        yield Measure(float(error / np.abs(total_force).max()), 1e-6, "sum of the instruments")
     for t in frames:
         traction = sequence["traction"][t]
         size = np.linalg.norm(traction, axis=-1)
-        whole[t] = (size[~inside] <= 0.02 * size.max()).all()
-        shown[t] = (traction * area[..., None]).sum(axis=(0, 1), dtype=np.float64)
-    size = np.maximum(*(np.linalg.norm(one, axis=1) for one in (applied, shown)))
+        in_view[t] = (size[~inside] <= 0.02 * size.max()).all()
+        pixel_force[t] = (traction * area[..., None]).sum(axis=(0, 1), dtype=np.float64)
+    size = np.maximum(*(np.linalg.norm(vectors, axis=1) for vectors in (total_force, pixel_force)))
     if not size.max() > 0:
         yield Nothing("no force in any frame")
         return
     for t in frames:
         if size[t] > 0.05 * size.max():
-            off = float(np.linalg.norm(shown[t] - applied[t]) / size[t])
-            yield Measure(off, 0.01 if whole[t] else 0.5, f"frame {t}")
+            error = float(np.linalg.norm(pixel_force[t] - total_force[t]) / size[t])
+            yield Measure(error, 0.01 if in_view[t] else 0.5, f"frame {t}")
 
 
 def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
@@ -68,30 +68,33 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
     """
     mechanics = sequence.attrs.get("mechanics") or {}
     if "work_mn_mm" in mechanics:
-        done = np.asarray(mechanics["work_mn_mm"], np.float64)
-        yield Measure(-float(done.min() / np.abs(done).max(initial=1e-9)), 0.02, f"frame {done.argmin()}")
+        load_work = np.asarray(mechanics["work_mn_mm"], np.float64)
+        yield Measure(
+            -float(load_work.min() / np.abs(load_work).max(initial=1e-9)), 0.02, f"frame {load_work.argmin()}"
+        )
         return
-    raised, instruments = mechanics.get("pulse_work_mn_mm"), mechanics.get("instruments")
-    known = mechanics.get("energy_mn_mm" if raised is None else "tool_work_mn_mm")
-    if not (mechanics.get("elastic") or raised is not None) or known is None or not instruments:
+    pulse_work, instruments = mechanics.get("pulse_work_mn_mm"), mechanics.get("instruments")
+    energy = mechanics.get("energy_mn_mm" if pulse_work is None else "tool_work_mn_mm")
+    if not (mechanics.get("elastic") or pulse_work is not None) or energy is None or not instruments:
         yield Nothing("inertia, relaxation, no instruments, or mechanics without energy")
         return
-    if raised is not None and len(instruments) > 1:
+    if pulse_work is not None and len(instruments) > 1:
         # The instruments' shares of the pulse may cancel, but not their uncertainties.
         yield Nothing("a pulse and several instruments")
         return
-    forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)
-    work = np.asarray(known, np.float64)
-    pulse = np.zeros(len(work)) if raised is None else _PULSE_KNOWN * np.abs(raised)
+    forces = np.stack([instrument["force_mn"] for instrument in instruments], axis=1)  # (T, I, 3)
+    work = np.asarray(energy, np.float64)
+    pulse = np.zeros(len(work)) if pulse_work is None else _PULSE_KNOWN * np.abs(pulse_work)
     size = np.linalg.norm(forces, axis=(1, 2))
     for t in range(1, len(work)):
-        two = slice(t - 1, t + 1)
-        unsure, least = float(max(pulse[two] / np.maximum(work[two], 1e-300))), float(size[two].min())
-        if least > 0.05 * size.max() and 0 <= unsure < _COMPLIANCE_STEP:
-            before, now = work[two] / size[two] ** 2
+        pair = slice(t - 1, t + 1)
+        uncertainty = float(max(pulse[pair] / np.maximum(work[pair], 1e-300)))
+        least_force = float(size[pair].min())
+        if least_force > 0.05 * size.max() and 0 <= uncertainty < _COMPLIANCE_STEP:
+            before, now = work[pair] / size[pair] ** 2
             step = float(np.exp(np.abs(np.log(now / before)))) - 1
-            changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / least
-            yield Measure(step, _COMPLIANCE_STEP + changed + 2 * unsure, f"frame {t}")
+            force_change = float(np.linalg.norm(forces[t] - forces[t - 1])) / least_force
+            yield Measure(step, _COMPLIANCE_STEP + force_change + 2 * uncertainty, f"frame {t}")
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -113,22 +116,24 @@ def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """A frame warped back by the true flow resembles the rest frame: remaining difference (relative)."""
-    first = _contrast(sequence["rgb"][0])
-    clear = sequence["tissue"][:] & ~_near(sequence["tool"][0] | sequence["glare"][0])
+    rest_contrast = _contrast(sequence["rgb"][0])
+    clear = sequence["tissue"][:] & ~_dilate(sequence["tool"][0] | sequence["glare"][0])
     for t in frames:
         flow = sequence["flow"][t]
         x, y = _targets(flow)
-        blocked = _near(sequence["tool"][t] | sequence["glare"][t])
-        free = cv2.remap(blocked.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderValue=1) == 0
+        blocked = _dilate(sequence["tool"][t] | sequence["glare"][t])
+        unblocked = cv2.remap(blocked.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderValue=1) == 0
         # Smaller motion hardly changes smooth tissue: differences would be highlights and noise only.
-        moved = np.hypot(flow[..., 0], flow[..., 1]) > 3.0
-        where = clear & sequence["visible"][t] & free & ~blocked & moved
-        if where.sum() < 200:
+        moving = np.hypot(flow[..., 0], flow[..., 1]) > 3.0
+        pixels = clear & sequence["visible"][t] & unblocked & ~blocked & moving
+        if pixels.sum() < 200:
             continue
-        now = _contrast(sequence["rgb"][t])
-        undone = cv2.remap(now, x, y, cv2.INTER_LINEAR)
-        before, after = (float(np.abs(one - first)[where].mean()) for one in (now, undone))
-        yield Measure(after / max(before, 1e-9), 1.0, f"frame {t}")
+        contrast = _contrast(sequence["rgb"][t])
+        unwarped = cv2.remap(contrast, x, y, cv2.INTER_LINEAR)
+        rest_error, warped_error = (
+            float(np.abs(picture - rest_contrast)[pixels].mean()) for picture in (contrast, unwarped)
+        )
+        yield Measure(warped_error / max(rest_error, 1e-9), 1.0, f"frame {t}")
 
 
 def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -140,16 +145,18 @@ def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]
             continue
         count = int(visible.sum())
         cell = np.stack([y[visible].round(), x[visible].round()], axis=1)
-        _, landed, times = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-        landed, off = landed.ravel(), np.zeros(len(landed))
+        _, targets, counts = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        targets, squared_error = targets.ravel(), np.zeros(len(targets))
         for start in np.nonzero(visible):
             # Back from a pixel of this frame: the mean of all rest pixels that moved to it.
-            off += (start - (np.bincount(landed, start) / times)[landed]) ** 2
-        yield Measure(float((off > _RETURN_PX**2).sum()) / count, 0.005, f"frame {t}: points don't return")
+            squared_error += (start - (np.bincount(targets, start) / counts)[targets]) ** 2
+        yield Measure(
+            float((squared_error > _RETURN_PX**2).sum()) / count, 0.005, f"frame {t}: points don't return"
+        )
         corners = visible[:-1, :-1] & visible[1:, :-1] & visible[:-1, 1:]
-        turned = (x[:-1, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, :-1])
-        turned -= (y[:-1, 1:] - y[:-1, :-1]) * (x[1:, :-1] - x[:-1, :-1])
-        yield Measure(float((corners & (turned < 0)).sum()) / count, 0.005, f"frame {t}: turned over")
+        orientation = (x[:-1, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, :-1])
+        orientation -= (y[:-1, 1:] - y[:-1, :-1]) * (x[1:, :-1] - x[:-1, :-1])
+        yield Measure(float((corners & (orientation < 0)).sum()) / count, 0.005, f"frame {t}: turned over")
 
 
 def _targets(flow: Array) -> tuple[Map, Map]:
@@ -158,7 +165,7 @@ def _targets(flow: Array) -> tuple[Map, Map]:
     return (columns + flow[..., 0]).astype(np.float32), (rows + flow[..., 1]).astype(np.float32)
 
 
-def _near(mask: Mask) -> Mask:
+def _dilate(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)), bool)
 
 

@@ -27,34 +27,36 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]
     left, right = optics.camera_of(sequence), right_of(sequence)
     rest_depth = sequence["depth"][0].astype(np.float64)
     core = inner(sequence["tissue"][:] & ~sequence["tool"][0], 2)
-    rows, columns = (at[::_EVERY] for at in np.nonzero(core & (rest_depth > 0)))
+    rows, columns = (indices[::_EVERY] for indices in np.nonzero(core & (rest_depth > 0)))
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)
     if not len(pixels):
         yield Nothing("no tissue in view")
         return
     points = cameras.rays(left, pixels) * rest_depth[rows, columns][:, None]
     expected, (turn, shift) = cameras.disparity(left, right, points), cameras.between(left, right)
-    found = sequence["disparity"][:][rows, columns]
-    yield Measure(float(np.abs(found - expected).max(initial=0)), 1e-3, "rest disparity from depth", "px")
-    half = _HALF_PX if sequence["flow"].stored == np.float16 else 0.0
+    disparity = sequence["disparity"][:][rows, columns]
+    yield Measure(float(np.abs(disparity - expected).max(initial=0)), 1e-3, "rest disparity from depth", "px")
+    rounding_px = _HALF_PX if sequence["flow"].stored == np.float16 else 0.0
     for t in frames:
-        moved = points + sequence["motion"][t][rows, columns]
-        flow = cameras.to_pixels(left, moved) - pixels
-        off = float(np.abs(sequence["flow"][t][rows, columns] - flow).max(initial=0))
-        yield Measure(off, 1e-3 + half, f"frame {t}: left flow from motion", "px")
+        moved_points = points + sequence["motion"][t][rows, columns]
+        flow = cameras.to_pixels(left, moved_points) - pixels
+        error_px = float(np.abs(sequence["flow"][t][rows, columns] - flow).max(initial=0))
+        yield Measure(error_px, 1e-3 + rounding_px, f"frame {t}: left flow from motion", "px")
         # Medians, as interpolation is wrong at edges.
         visible = sequence["visible"][t][rows, columns]
-        yield from _depth(sequence, t, "depth", cameras.to_pixels(left, moved), moved, visible)
-        there = moved @ turn.T + shift
-        start, end = (cameras.to_pixels(right, one) for one in (points @ turn.T + shift, there))
+        yield from _depth(sequence, t, "depth", cameras.to_pixels(left, moved_points), moved_points, visible)
+        right_points = moved_points @ turn.T + shift
+        start, end = (
+            cameras.to_pixels(right, positions) for positions in (points @ turn.T + shift, right_points)
+        )
         if {"flow_right", "visible_right"} <= set(sequence.fields):
-            visible &= _sampled(sequence["visible_right"][t].astype(np.float32), start) > 0.99
+            visible &= _sample_field(sequence["visible_right"][t].astype(np.float32), start) > 0.99
             if visible.sum() > _FEWEST:
-                off_px = np.abs(_sampled(sequence["flow_right"][t], start) - (end - start))[visible]
-                middle, most = np.quantile(off_px.max(axis=1), (0.5, 0.95)).tolist()
-                yield Measure(middle, 5e-3 + half, f"frame {t}: right flow from motion", "px")
-                yield Measure(most, 0.1 + half, f"frame {t}: right flow of 95%", "px")
-        yield from _depth(sequence, t, "depth_right", end, there, visible)
+                errors_px = np.abs(_sample_field(sequence["flow_right"][t], start) - (end - start))[visible]
+                median, upper = np.quantile(errors_px.max(axis=1), (0.5, 0.95)).tolist()
+                yield Measure(median, 5e-3 + rounding_px, f"frame {t}: right flow from motion", "px")
+                yield Measure(upper, 0.1 + rounding_px, f"frame {t}: right flow of 95%", "px")
+        yield from _depth(sequence, t, "depth_right", end, right_points, visible)
 
 
 def right_of(sequence: Sequence) -> cameras.Camera:
@@ -63,17 +65,17 @@ def right_of(sequence: Sequence) -> cameras.Camera:
 
 
 def _depth(
-    sequence: Sequence, t: int, name: str, pixels: Floats, moved: Floats, visible: Mask
+    sequence: Sequence, t: int, name: str, pixels: Floats, points: Floats, visible: Mask
 ) -> Iterator[Measure]:
     """A camera's depth at pixels (N, 2), against that of the points (N, 3) mm visible there."""
     if name in sequence and visible.sum() > _FEWEST:
-        off = np.abs(_sampled(sequence[name][t], pixels) - moved[:, 2])[visible]
-        middle, most = (np.quantile(off, (0.5, 0.9)) / float(sequence.attrs["translation"][2])).tolist()
-        yield Measure(middle, 2e-5, f"frame {t}: {name} from motion")
-        yield Measure(most, 5e-4, f"frame {t}: {name} of 90%")
+        errors = np.abs(_sample_field(sequence[name][t], pixels) - points[:, 2])[visible]
+        median, upper = (np.quantile(errors, (0.5, 0.9)) / float(sequence.attrs["translation"][2])).tolist()
+        yield Measure(median, 2e-5, f"frame {t}: {name} from motion")
+        yield Measure(upper, 5e-4, f"frame {t}: {name} of 90%")
 
 
-def _sampled(field: NDArray[np.floating], pixels: Floats) -> Map:
+def _sample_field(field: NDArray[np.floating], pixels: Floats) -> Map:
     x, y = np.ascontiguousarray(pixels.T, np.float32)
-    found = cv2.remap(field.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR, borderValue=0)
-    return np.asarray(found[0], np.float32)
+    samples = cv2.remap(field.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR, borderValue=0)
+    return np.asarray(samples[0], np.float32)

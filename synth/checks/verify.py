@@ -75,19 +75,19 @@ class Check:
     cpu_s: float = 0.0
     failures: list[str] = field(default_factory=list)  # places of all bad measures
 
-    def add(self, measure: Measure | Nothing, who: str) -> None:
+    def add(self, measure: Measure | Nothing, owner: str) -> None:
         if isinstance(measure, Nothing):
             self.skipped += 1
             self.why[measure.why] = self.why.get(measure.why, 0) + 1
             return
         self.count += 1
-        where = f"{who}: {measure.where}"
+        place = f"{owner}: {measure.place}"
         if not measure.good:
             self.bad += 1
-            self.failures.append(where)
+            self.failures.append(place)
         if measure.severity > (Measure(self.worst, self.limit, "").severity if self.offender else 0):
             self.worst, self.limit, self.unit = measure.value, measure.limit, measure.unit
-            self.offender = where
+            self.offender = place
 
 
 @dataclass(frozen=True)
@@ -108,22 +108,21 @@ class VerifyReport:
     @property
     def verdict(self) -> str:
         """Whether it is good, by how many checks, and which of them had nothing to look at, and why."""
-        bad = [check.name for check in self.checks if check.bad]
-        done = sum(check.count > 0 for check in self.checks)
-        found = f"good: {done} checks"
+        failed = [check.name for check in self.checks if check.bad]
+        measured_count = sum(check.count > 0 for check in self.checks)
+        text = f"good: {measured_count} checks"
         if self.cautions:
             several = "are doubts" if len(self.cautions) > 1 else "is a doubt"
-            found = (
-                f"doubtful: {done} checks hold, but there {several} about the mechanics.source, listed above"
-            )
-        if bad:
-            found = f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}"
-        for what, some in ("nothing", False), ("in some sequences nothing", True):
-            empty = [one for one in self.checks if one.skipped and bool(one.count) == some]
+            doubts = f"there {several} about the mechanics.source, listed above"
+            text = f"doubtful: {measured_count} checks hold, but {doubts}"
+        if failed:
+            text = f"not good: {len(failed)} of {measured_count} checks failed: {', '.join(failed)}"
+        for what, measured in ("nothing", False), ("in some sequences nothing", True):
+            empty = [check for check in self.checks if check.skipped and bool(check.count) == measured]
             if empty:
-                named = ", ".join(f"{one.name} ({' or '.join(one.why)})" for one in empty)
-                found += f"; {len(empty)} had {what} to check: {named}"
-        return found
+                reasons = ", ".join(f"{check.name} ({' or '.join(check.why)})" for check in empty)
+                text += f"; {len(empty)} had {what} to check: {reasons}"
+        return text
 
     def as_dict(self) -> dict[str, Any]:
         return {**asdict(self), "good": self.good, "verdict": self.verdict}
@@ -137,13 +136,13 @@ class VerifyReport:
             rows.append((*counts, *worst, f"{check.cpu_s:.2f}", check.offender))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         table = []
-        for *cells, where in rows:
-            front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=False))
-            table += hang(front, where)
+        for *cells, place in rows:
+            front = "".join(f"{cell:<{width}}  " for cell, width in zip(cells, widths, strict=False))
+            table += hang(front, place)
         failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
         doubts = [
-            f"doubtful in {len(those)} sequences, first {those[0]}: {text}"
-            for text, those in self.cautions.items()
+            f"doubtful in {len(sequences)} sequences, first {sequences[0]}: {text}"
+            for text, sequences in self.cautions.items()
         ]
         return [*table, *failures, *doubts, self.verdict]
 
@@ -154,17 +153,17 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     `fast`: only some frames of some sequences, without checksums.
     """
     folder = Folder(root)
-    described, sealed = folder.described(), folder.sealed()
+    description, indices = folder.read_description(), folder.list_sealed()
     checks = {name: Check(name, meaning) for name, meaning in MEANINGS.items()}
     watch = Stopwatch()
     with watch.stage("dataset"):
-        for name, who, good, where in _dataset(folder, described, sealed):
-            checks[name].add(truth(good, where), who)
-    if fast and len(sealed) > _FAST_SEQUENCES:
-        sealed = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
-    for key in sealed:
+        for name, owner, good, message in _check_dataset(folder, description, indices):
+            checks[name].add(truth(good, message), owner)
+    if fast and len(indices) > _FAST_SEQUENCES:
+        indices = [indices[k] for k in np.linspace(0, len(indices) - 1, _FAST_SEQUENCES).astype(int)]
+    for key in indices:
         path = location.store(folder.root, key)
-        for name, measure in check_sequence(path, described["identity"], watch, fast=fast):
+        for name, measure in check_sequence(path, description["identity"], watch, fast=fast):
             checks[name].add(measure, path.name)
     for name, check in checks.items():
         check.cpu_s = watch.cpu_s(name)
@@ -173,7 +172,7 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
                 Nothing("not with --fast" if fast and name == "checksum" else "no sequence is readable"), ""
             )
     return VerifyReport(
-        str(root), len(sealed), fast, list(checks.values()), index.list_cautions(root, sealed)
+        str(root), len(indices), fast, list(checks.values()), index.list_cautions(root, indices)
     )
 
 
@@ -197,64 +196,64 @@ def check_sequence(
     yield "dataset", truth(sequence.attrs.get("job") == job, "belongs to another job")
     # Frames are that of the largest load, and some spread over the sequence.
     spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
-    frames, broken = sorted({int(np.argmax(size)), *spread.tolist()}), ""
+    frames, fault = sorted({int(np.argmax(size)), *spread.tolist()}), ""
     try:
         yield from contents.check_values(sequence, frames, fast, watch)
     except UserError as error:
-        broken = without_path(error)
+        fault = without_path(error)
     for name, invariant in INVARIANTS.items():
         empty = Nothing(_NOTHING.get(name, "no tissue in view"))
         try:
             with watch.stage(name):
                 measures = list(invariant(sequence, frames)) or [empty]
         except UserError as error:
-            broken = broken or without_path(error)
+            fault = fault or without_path(error)
             continue
         except (KeyError, IndexError, TypeError, ValueError) as error:
             measures = [truth(False, f"attributes are missing or invalid ({error!r})")]
         yield from ((name, measure) for measure in measures)
-    yield "readable", truth(not broken, broken)
+    yield "readable", truth(not fault, fault)
 
 
-def _dataset(
-    folder: Folder, described: dict[str, Any], sealed: list[int]
+def _check_dataset(
+    folder: Folder, description: dict[str, Any], indices: list[int]
 ) -> Iterator[tuple[str, str, bool, str]]:
     """Yields name of check, file, whether it holds, and the message if it doesn't."""
     job = folder.job()
-    makers = {provenance.word(one) for one in described.get("generators", [])}
+    makers = {provenance.word(maker) for maker in description.get("generators", [])}
     try:
-        same = identity.identify_job(job) == described["identity"] or provenance.fingerprint() not in makers
+        same = identity.identify_job(job) == description["identity"] or provenance.fingerprint() not in makers
     except UserError:
         same = True  # the mesh or photograph may be missing
     yield "dataset", "dataset.json", same, "the job was edited after rendering"
-    yield "dataset", "dataset", bool(sealed), "no sequence was finished"
-    missing = sorted(set(range(job.sequences)) - set(sealed) - set(folder.failures()))
+    yield "dataset", "dataset", bool(indices), "no sequence was finished"
+    missing = sorted(set(range(job.sequences)) - set(indices) - set(folder.failures()))
     yield "dataset", "dataset", not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"
-    surplus = [key for key in sealed if key >= job.sequences]
+    surplus = [key for key in indices if key >= job.sequences]
     yield "dataset", "dataset", not surplus, f"sequences beyond those of the job: {surplus[:3]}"
     try:
         rows = {row["index"]: row for row in index.read_index(folder.root).to_pylist()}
     except UserError as error:
         yield "dataset", index.NAME, False, str(error)
         return
-    for key in sealed:
+    for key in indices:
         try:
-            found = open_sequence(location.store(folder.root, key), sealed=False)
+            sequence = open_sequence(location.store(folder.root, key), sealed=False)
         except UserError:
             continue  # reported by the check of that sequence
         row = rows.get(key, {})
-        differing = [name for name, value in index.row_of(found).items() if row.get(name) != value]
+        differing = [name for name, value in index.row_of(sequence).items() if row.get(name) != value]
         yield "dataset", index.NAME, not differing, f"row {key} differs in {', '.join(differing)}"
-        known = found.attrs.get("versions", {}).get("generator") in makers
-        yield "dataset", found.path.name, known, "its version is not in dataset.json"
-    lost = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
-    yield "dataset", index.NAME, not lost, f"rows without a sequence: {lost[:3]}"
+        is_known = sequence.attrs.get("versions", {}).get("generator") in makers
+        yield "dataset", sequence.path.name, is_known, "its version is not in dataset.json"
+    lost_keys = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in indices)
+    yield "dataset", index.NAME, not lost_keys, f"rows without a sequence: {lost_keys[:3]}"
     try:
         stored = sequence_split.read_stored(folder.root)
     except UserError as error:
         yield "splits", sequence_split.NAME, False, str(error)
         return
-    leaking = sequence_split.leaks(list(rows.values()), stored) or sequence_split.misplaced(
+    leaks = sequence_split.find_leaks(list(rows.values()), stored) or sequence_split.find_misplaced(
         list(rows.values()), stored
     )
-    yield "splits", index.NAME, not leaking, "; ".join(leaking[:3]) or "none"
+    yield "splits", index.NAME, not leaks, "; ".join(leaks[:3]) or "none"

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from synth.errors import UserError
 from synth.formats import STORE, check_format
 from synth.system.checked_file import LARGEST_PIXELS
-from synth.system.config_file import validated
+from synth.system.config_file import validate_values
 
 FORMAT = "sulcus-sequence"
 
@@ -63,14 +63,14 @@ class Attributes(BaseModel):
     versions: dict[str, str] = {}
 
 
-def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
-    """Raises UserError, with the store's name `where`, if it is not a sequence or an attribute is invalid."""
+def check_attributes(attrs: Mapping[str, Any], label: str) -> None:
+    """Raises UserError, with the store's name `label`, if it is not a sequence or an attribute is invalid."""
     if attrs.get("format") != FORMAT:
-        raise UserError(f"{where}: is a Zarr store, but not a sequence")
-    check_format(attrs.get("format_version"), STORE, where)
-    width, height = validated(Attributes, dict(attrs), f"{where}: an attribute is invalid").size
+        raise UserError(f"{label}: is a Zarr store, but not a sequence")
+    check_format(attrs.get("format_version"), STORE, label)
+    width, height = validate_values(Attributes, dict(attrs), f"{label}: an attribute is invalid").size
     if width * height > LARGEST_PIXELS:
-        raise UserError(f"{where}: {width} x {height} pixels per frame is too large")
+        raise UserError(f"{label}: {width} x {height} pixels per frame is too large")
 
 
 def gestures_of(attrs: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -80,11 +80,13 @@ def gestures_of(attrs: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def cautions_of(attrs: Mapping[str, Any]) -> list[str]:
     """What is doubtful about a sequence's mechanics, as another program's files state them."""
-    found = (attrs.get("mechanics") or {}).get("cautions", [])
-    texts = [one[:500] for one in found if isinstance(one, str)] if isinstance(found, list) else []
+    cautions = (attrs.get("mechanics") or {}).get("cautions", [])
+    if not isinstance(cautions, list):
+        return []
+    texts = [caution[:500] for caution in cautions if isinstance(caution, str)]
     return ["".join(c if c.isprintable() else "?" for c in text) for text in texts]
 
 
 def name_gestures(attrs: Mapping[str, Any], of: str = "kind") -> str:
     """Gestures of all instruments ("pull + push") or, by `of`, their "instrument"; may be empty."""
-    return " + ".join(one[of] for one in gestures_of(attrs) if one.get(of))
+    return " + ".join(gesture[of] for gesture in gestures_of(attrs) if gesture.get(of))

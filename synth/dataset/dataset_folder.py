@@ -24,7 +24,7 @@ from synth.job.schema import Job
 from synth.plugins import STORED
 from synth.system import checked_file, file_lock
 from synth.system.checked_file import write_whole as write_whole
-from synth.system.config_file import validated
+from synth.system.config_file import validate_values
 
 _NAME = "dataset.json"
 _GATE_S = 3600.0  # that a part waits for the others to begin, or for one that writes the index
@@ -56,8 +56,8 @@ class Part:
 
 def parse_part(text: str) -> Part:
     """A part such as 3/40. UserError: it is none."""
-    found = re.fullmatch(r"\s*(\d{1,5})\s*/\s*(\d{1,5})\s*", text)
-    part = Part(int(found[1]), int(found[2])) if found else None
+    match = re.fullmatch(r"\s*(\d{1,5})\s*/\s*(\d{1,5})\s*", text)
+    part = Part(int(match[1]), int(match[2])) if match else None
     if part is None or not 1 <= part.number <= part.count:
         raise UserError(f"--part {text}: give NUMBER/COUNT, the number from 1, such as 3/40")
     return part
@@ -83,52 +83,52 @@ class Folder:
         """Whether it has a job."""
         return os.path.lexists(self.root / _NAME)
 
-    def described(self) -> dict[str, Any]:
+    def read_description(self) -> dict[str, Any]:
         """The content of `dataset.json`. UserError if it is missing, damaged or of an unsupported format."""
         if not self.is_begun:
             raise UserError(f"{self.root}: is not a dataset ({_NAME} is missing)")
-        found = checked_file.read_json(self.root / _NAME)
-        if isinstance(found, dict):
-            check_format(found.get("format_version", 1), FOLDER, str(self.root / _NAME))
-        return validated(_Described, found, f"{self.root / _NAME}: is damaged").model_dump()
+        content = checked_file.read_json(self.root / _NAME)
+        if isinstance(content, dict):
+            check_format(content.get("format_version", 1), FOLDER, str(self.root / _NAME))
+        return validate_values(_Described, content, f"{self.root / _NAME}: is damaged").model_dump()
 
     def job(self) -> Job:
         """The dataset's job; its plug-ins need not be installed."""
-        described = self.described()
-        job = described["job"]
+        description = self.read_description()
+        job = description["job"]
         render, sensor = job.get("render"), job.get("sensor")
-        if described["format_version"] < 4 and isinstance(render, dict) and isinstance(sensor, dict):
+        if description["format_version"] < 4 and isinstance(render, dict) and isinstance(sensor, dict):
             render["scenery"] = [part for part in render.get("scenery", ()) if part != "cottonoid"]
             sensor["blur_px"] = sensor.get("blur_px", 0.0) * BLUR_WIDTH_PX / render.get("size", (640,))[0]
-        return validated(Job, job, f"{self.root / _NAME}: is damaged", STORED)
+        return validate_values(Job, job, f"{self.root / _NAME}: is damaged", STORED)
 
     def refuse_replaced(self, job: Job, name: str) -> None:
         """Raises UserError if files of the folder's own job are no longer those that it was begun with.
 
         `name`: identity of `job` by its files as they are now.
         """
-        if not self.is_begun or (described := self.described())["identity"] == name:
+        if not self.is_begun or (description := self.read_description())["identity"] == name:
             return
-        if not _changes(described["job"], job.model_dump(mode="json")):
+        if not _list_changes(description["job"], job.model_dump(mode="json")):
             files = "mechanics.source, anatomy.mesh, appearance.photo, render.calibration or fem.instrument"
             why = f"a file of {files} was replaced since the dataset was begun"
             raise UserError(f"{self.root}: {why}; restore it, or choose another folder")
 
-    def sealed(self) -> list[int]:
+    def list_sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
         with os.scandir(self.root) as entries:
-            found = [location.index_of(entry.name) for entry in entries]
-        return sorted(index for index in found if index is not None)
+            indices = [location.index_of(entry.name) for entry in entries]
+        return sorted(index for index in indices if index is not None)
 
     def failures(self) -> dict[int, dict[str, Any]]:
         """`{index: {"reason", "kind", "tries", "log"}}` of the failed sequences."""
-        found = {}
+        failures = {}
         for path in sorted((self.state / "failed").glob("*.json")):
             with suppress(UserError, ValueError):  # damaged: the sequence is computed again
                 failure = checked_file.read_json(path)
                 if isinstance(failure, dict) and isinstance(failure.get("reason"), str):
-                    found[int(path.stem)] = failure
-        return found
+                    failures[int(path.stem)] = failure
+        return failures
 
     def mark_failed(self, failure: dict[str, Any]) -> None:
         """Marks the sequence `failure["index"]` as failed, until `synth render --retry`."""
@@ -142,9 +142,9 @@ class Folder:
 
     def sweep(self, index: int) -> None:
         """Deletes the unfinished store of sequence `index`."""
-        sealed = location.store(self.root, index)
-        leftover = sealed.with_name(f"{sealed.name}.part")
-        if leftover.exists() and not sealed.exists():
+        store = location.store(self.root, index)
+        leftover = store.with_name(f"{store.name}.part")
+        if leftover.exists() and not store.exists():
             shutil.rmtree(leftover)
 
     def computes(self, index: int) -> bool:
@@ -177,7 +177,7 @@ class Folder:
     def sweep_all(self) -> None:
         """Deletes all files of interrupted attempts; beside runs of other parts, only its own stores."""
         if self.part is not None and self.running():
-            for index in filter(self.computes, location.unfinished(self.root)):
+            for index in filter(self.computes, location.list_unfinished(self.root)):
                 self.sweep(index)
             return
         for folder in (*self.root.glob("*.zarr.part"), *self.scratch.glob("*")):
@@ -190,10 +190,10 @@ class Folder:
     def invalidate_workers(self) -> None:
         """Makes workers of an earlier run on other machines end, by a new turn."""
         try:
-            before = int(self.turn_file.read_text())
+            last_turn = int(self.turn_file.read_text())
         except (FileNotFoundError, ValueError):
-            before = 0
-        self.turn = before + 1
+            last_turn = 0
+        self.turn = last_turn + 1
         write_whole(self.turn_file, str(self.turn), durable=False)
 
     def discard(self) -> None:
@@ -215,19 +215,19 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False, part: Part | None
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
-        own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
-        for place in (*own, *root.glob("*.zarr.part")):
+        run_files = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
+        for place in (*run_files, *root.glob("*.zarr.part")):
             if place.is_symlink():  # a run writes or deletes here
                 raise UserError(f"{place}: is a link; remove it")
         folder.state.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as held:
+        with ExitStack() as locks:
             with folder.gate():
                 if part is None and folder.running():
                     raise file_lock.Locked
                 others = {file.stem.partition("-of-")[2] for file in folder.running()}
                 if part is not None and others - {f"{part.count:05d}"}:  # a whole run, or another division
                     raise file_lock.Locked
-                folder.lock_fd = held.enter_context(file_lock.hold(folder.lock_file))
+                folder.lock_fd = locks.enter_context(file_lock.hold(folder.lock_file))
                 _refuse_foreign(folder, job, name)
                 _begin(folder, job, name, _makers(folder, mix_versions))
             try:
@@ -235,7 +235,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False, part: Part | None
             finally:
                 if part is None:
                     folder.invalidate_workers()
-                    if fresh and not folder.sealed() and not folder.failures():
+                    if fresh and not folder.list_sealed() and not folder.failures():
                         folder.discard()
                         if created and not any(root.iterdir()):  # an interrupted sequence may be left
                             root.rmdir()
@@ -252,8 +252,8 @@ def _begin(folder: Folder, job: Job, name: str, makers: list[dict[str, str]]) ->
     for place in (folder.state / "failed", folder.logs, folder.scratch):
         place.mkdir(exist_ok=True)
     values = job.model_dump(mode="json")
-    described = _Described(format_version=FOLDER, identity=name, job=values, generators=makers)
-    text = described.model_dump_json(indent=1) + "\n"
+    description = _Described(format_version=FOLDER, identity=name, job=values, generators=makers)
+    text = description.model_dump_json(indent=1) + "\n"
     if not folder.running() or not folder.is_begun or (folder.root / _NAME).read_text("utf-8") != text:
         write_whole(folder.root / _NAME, text)
         head = "# The job of this dataset, with all values.\n"
@@ -276,16 +276,16 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
             if others:
                 raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
             return
-    described = folder.described()
+    description = folder.read_description()
     if (
-        described["identity"] != name
-        and not folder.sealed()
+        description["identity"] != name
+        and not folder.list_sealed()
         and not folder.failures()
         and not folder.running()
     ):
         return  # nothing was finished of the other one, and nobody computes it
-    if described["identity"] != name:
-        changes = _changes(described["job"], job.model_dump(mode="json"))
+    if description["identity"] != name:
+        changes = _list_changes(description["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: contains the dataset of another job ({what}); choose another folder")
     if (count := folder.job().sequences) > job.sequences:
@@ -294,14 +294,16 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     """The versions that created the dataset, including this one. UserError if they may not be mixed."""
-    now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
-    before: list[dict[str, str]] = folder.described()["generators"] if count else []
-    if mix or not count or [*map(provenance.word, before)] == [provenance.word(now)]:
-        known = {provenance.word(one) for one in before}
-        return [*before, *([] if provenance.word(now) in known else [now])]
-    last = provenance.compared(before[-1]) if before else {}
-    changed = (key for key in provenance.compared(now) if last.get(key) != now[key])
-    changes = [f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in changed]
+    this_maker, count = provenance.generator(), len(folder.list_sealed()) if folder.root.is_dir() else 0
+    makers: list[dict[str, str]] = folder.read_description()["generators"] if count else []
+    if mix or not count or [*map(provenance.word, makers)] == [provenance.word(this_maker)]:
+        names = {provenance.word(maker) for maker in makers}
+        return [*makers, *([] if provenance.word(this_maker) in names else [this_maker])]
+    last_versions = provenance.select_compared(makers[-1]) if makers else {}
+    changed = (
+        key for key in provenance.select_compared(this_maker) if last_versions.get(key) != this_maker[key]
+    )
+    changes = [f"{key} {last_versions.get(key, 'unknown')}, now {this_maker[key]}" for key in changed]
     what = "; ".join(changes) or "several versions"
     raise UserError(
         f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
@@ -309,12 +311,12 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     )
 
 
-def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[str]:
-    found = []
-    for key in sorted((before.keys() | now.keys()) - {"card"}):
-        old, new = before.get(key), now.get(key)
+def _list_changes(old_values: dict[str, Any], new_values: dict[str, Any], prefix: str = "") -> list[str]:
+    changes = []
+    for key in sorted((old_values.keys() | new_values.keys()) - {"card"}):
+        old, new = old_values.get(key), new_values.get(key)
         if isinstance(old, dict) and isinstance(new, dict):
-            found += _changes(old, new, f"{at}{key}.")
-        elif old != new and f"{at}{key}" != "sequences":
-            found.append(f"{at}{key} is {json.dumps(old)} there and {json.dumps(new)} here")
-    return found
+            changes += _list_changes(old, new, f"{prefix}{key}.")
+        elif old != new and f"{prefix}{key}" != "sequences":
+            changes.append(f"{prefix}{key} is {json.dumps(old)} there and {json.dumps(new)} here")
+    return changes

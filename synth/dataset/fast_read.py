@@ -35,15 +35,15 @@ class ShardReader:
         """Frame `t`; negative `t` count from the end."""
         if not -self._length <= t < self._length:
             raise IndexError(t)
-        file, k = divmod(t % self._length, self._shard_frames)
-        name = self._folder / "c" / os.path.join(str(file), *("0" for _ in self._shape))
-        with name.open("rb", buffering=0) as opened:
-            if file not in self._entries:
-                self._entries[file] = self._index(opened.fileno())
-            start, length = (int(number) for number in self._entries[file][k])
+        shard, k = divmod(t % self._length, self._shard_frames)
+        path = self._folder / "c" / os.path.join(str(shard), *("0" for _ in self._shape))
+        with path.open("rb", buffering=0) as file:
+            if shard not in self._entries:
+                self._entries[shard] = self._index(file.fileno())
+            start, length = (int(number) for number in self._entries[shard][k])
             if _MISSING in (start, length):
                 raise ValueError(f"frame {t} was never written")
-            packed = _checked(os.pread(opened.fileno(), length, start), length)
+            packed = _strip_checksum(os.pread(file.fileno(), length, start), length)
         values = np.empty(self._shape, self._dtype)
         # Blosc's header has the unpacked size in bytes 4 to 7; a shorter frame would leave the rest unset.
         if len(packed) < 16 or int(packed[4:8].view("<u4")[0]) != values.nbytes:
@@ -57,7 +57,7 @@ class ShardReader:
         end = os.fstat(descriptor).st_size
         if end < length:
             raise ValueError("the file is truncated")
-        data = _checked(os.pread(descriptor, length, end - length), length)
+        data = _strip_checksum(os.pread(descriptor, length, end - length), length)
         return np.frombuffer(data, "<u8").reshape(-1, 2)
 
 
@@ -71,10 +71,10 @@ def open_frames(array: zarr.Array[Any], folder: Path) -> ShardReader | None:
     return ShardReader(folder, array.shape, array.shards[0], np.dtype(array.dtype))
 
 
-def _checked(data: bytes, length: int) -> Pixels:
+def _strip_checksum(data: bytes, length: int) -> Pixels:
     if len(data) != length or length < 4:
         raise ValueError("the file is truncated")
-    inner, stated = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")
-    if google_crc32c.value(inner) != stated:
+    payload, checksum = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")
+    if google_crc32c.value(payload) != checksum:
         raise ValueError("a checksum does not match")
-    return inner
+    return payload

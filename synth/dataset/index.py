@@ -39,10 +39,10 @@ class IndexColumn(NamedTuple):
         """The cell of a finished sequence; None if it has no such attribute."""
         if callable(self.source):
             return self.source(sequence)
-        found: Any = sequence.attrs
+        value: Any = sequence.attrs
         for step in (self.source or self.name).split("."):
-            found = found.get(step) if found else None
-        return found
+            value = value.get(step) if value else None
+        return value
 
 
 def _peak_motion_mm(sequence: Sequence) -> float | None:
@@ -55,25 +55,26 @@ _INT, _REAL, _TEXT = pa.int64(), pa.float64(), pa.string()
 # fmt: off
 COLUMNS = (
     IndexColumn("index", _INT, "position in the dataset"),
-    IndexColumn("status", _TEXT, "done or failed", source=lambda one: "done"),
-    IndexColumn("reason", _TEXT, "why it failed", source=lambda one: None),
-    IndexColumn("path", _TEXT, "the store, relative to this file", source=lambda one: one.path.name),
+    IndexColumn("status", _TEXT, "done or failed", source=lambda sequence: "done"),
+    IndexColumn("reason", _TEXT, "why it failed", source=lambda sequence: None),
+    IndexColumn("path", _TEXT, "the store, relative to this file",
+                source=lambda sequence: sequence.path.name),
     IndexColumn("content_hash", _TEXT, "hash of fields and attributes"),
     IndexColumn("anatomy", _TEXT,
                 "the geometry: a user's brain or the seed of a procedural one, the same in every dataset; "
                 "sequences that share it belong on one side of a split",
-                source=lambda one: sequence_split.name_anatomy(one.attrs)),
+                source=lambda sequence: sequence_split.name_anatomy(sequence.attrs)),
     IndexColumn("opening", _TEXT, "place of the craniotomy on a user's brain, named alike in every dataset",
                 source="opening_id"),
     IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
     IndexColumn("gesture", _TEXT, "kind of gesture of each instrument",
-                source=lambda one: name_gestures(one.attrs) or None),
+                source=lambda sequence: name_gestures(sequence.attrs) or None),
     IndexColumn("instrument", _TEXT, "instrument of each gesture; none: not drawn",
-                source=lambda one: name_gestures(one.attrs, "instrument") or None),
+                source=lambda sequence: name_gestures(sequence.attrs, "instrument") or None),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
-                source=lambda one: next(iter(gestures_of(one.attrs)), {}).get("load")),
+                source=lambda sequence: next(iter(gestures_of(sequence.attrs)), {}).get("load")),
     IndexColumn("attempt", _INT, "earlier draws of its gestures, whose loads the mesh did not bear",
                 source="scenario.attempt"),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
@@ -82,13 +83,13 @@ COLUMNS = (
                 _peak_motion_mm, "Peak motion"),
     IndexColumn("frames", _INT, "number of frames"),
     IndexColumn("fps", _REAL, "frames per second"),
-    IndexColumn("width", _INT, "width of the picture", "px", lambda one: one.size[1]),
-    IndexColumn("height", _INT, "height of the picture", "px", lambda one: one.size[0]),
+    IndexColumn("width", _INT, "width of the picture", "px", lambda sequence: sequence.size[1]),
+    IndexColumn("height", _INT, "height of the picture", "px", lambda sequence: sequence.size[0]),
     IndexColumn("scale_mm_per_px", _REAL, "scale at the craniotomy", "mm/px"),
     IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
     IndexColumn("split", _TEXT, "train, validation or test; null if there are too few anatomies to split"),
     IndexColumn("cpu_s", _REAL, "processor time of its creation", "s",
-                lambda one: math.fsum(one.stages_cpu_s.values())),
+                lambda sequence: math.fsum(sequence.stages_cpu_s.values())),
 )
 # fmt: on
 
@@ -116,10 +117,9 @@ def read_index(root: Path) -> pa.Table:
         if file.metadata.num_rows > _MOST_ROWS or file.metadata.schema.names != names:
             raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
         table = file.read(use_threads=False)
-        lacking = {name: pa.nulls(table.num_rows) for name in SCHEMA.names if name not in names}
-        table = (
-            pa.table(dict(zip(names, table.columns, strict=True)) | lacking).select(SCHEMA.names).cast(SCHEMA)
-        )
+        null_columns = {name: pa.nulls(table.num_rows) for name in SCHEMA.names if name not in names}
+        columns = dict(zip(names, table.columns, strict=True)) | null_columns
+        table = pa.table(columns).select(SCHEMA.names).cast(SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         raise UserError(f"{path}: is damaged ({first_line(error)}){_REMEDY}") from error
@@ -131,19 +131,20 @@ def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
     stored = sequence_split.read_stored(root)
     if stored.sides:
         return stored
-    rows = [row_of(open_sequence(location.store(root, key))) for key in Folder(root).sealed()]
+    rows = [row_of(open_sequence(location.store(root, key))) for key in Folder(root).list_sealed()]
     try:
         assign = sequence_split.assign_sides if required else sequence_split.assign_if_possible
-        return _dealt(rows, assign(rows, stored), stored)
+        return _add_sides(rows, assign(rows, stored), stored)
     except UserError as error:
         raise UserError(f"{root}: {error}") from None
 
 
 def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
     """Positions of sequences by side, without empty sides; all are "train" if there are too few to split."""
-    names, chosen = [one.attrs["content_hash"] for one in dataset], read_split(dataset.root, required=False)
-    found = chosen.find(names, dataset.root) if chosen.sides else ["train"] * len(names)
-    groups = {side: [k for k, one in enumerate(found) if one == side] for side in sequence_split.SIDES}
+    names = [sequence.attrs["content_hash"] for sequence in dataset]
+    split = read_split(dataset.root, required=False)
+    sides = split.find(names, dataset.root) if split.sides else ["train"] * len(names)
+    groups = {side: [k for k, other in enumerate(sides) if other == side] for side in sequence_split.SIDES}
     return {side: positions for side, positions in groups.items() if positions}
 
 
@@ -153,31 +154,36 @@ def write_index(folder: Folder, rule: DatasetSplit | None = None) -> list[dict[s
     New sequences are assigned a side, which is stored. `rule`, a split without sides, replaces the stored
     one; then UserError as `assign_sides`.
     """
-    known: dict[int, dict[str, Any]] = {}
+    known_rows: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
-        known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
+        known_rows = {
+            row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"
+        }
     failures = folder.failures().items()
-    each = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
-    stores = {key: location.store(folder.root, key) for key in folder.sealed()}
-    each |= {key: known.get(key) or row_of(open_sequence(path)) for key, path in stores.items()}
-    rows, chosen = [each[key] for key in sorted(each)], rule or sequence_split.read_stored(folder.root)
+    rows_by_index = {
+        k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures
+    }
+    stores = {key: location.store(folder.root, key) for key in folder.list_sealed()}
+    rows_by_index |= {key: known_rows.get(key) or row_of(open_sequence(path)) for key, path in stores.items()}
+    rows = [rows_by_index[key] for key in sorted(rows_by_index)]
+    split = rule or sequence_split.read_stored(folder.root)
     sides = (
-        sequence_split.assign_sides(rows, rule) if rule else sequence_split.assign_if_possible(rows, chosen)
+        sequence_split.assign_sides(rows, rule) if rule else sequence_split.assign_if_possible(rows, split)
     )
     for row, side in zip(rows, sides, strict=True):
         row["split"] = side
     if any(sides):
-        sequence_split.store(folder.root, _dealt(rows, sides, chosen))
+        sequence_split.store(folder.root, _add_sides(rows, sides, split))
     save_rows(folder.root, rows)
     return rows
 
 
-def _dealt(
-    rows: Iterable[Mapping[str, Any]], sides: Iterable[Side | None], chosen: DatasetSplit
+def _add_sides(
+    rows: Iterable[Mapping[str, Any]], sides: Iterable[Side | None], split: DatasetSplit
 ) -> DatasetSplit:
     """The split with the sides of the rows added."""
     added = {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side}
-    return replace(chosen, sides={**chosen.sides, **added})
+    return replace(split, sides={**split.sides, **added})
 
 
 def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -193,14 +199,14 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     return {column.name: column.read(sequence) for column in COLUMNS if column.name != "split"}
 
 
-def list_cautions(root: Path, sealed: Iterable[int]) -> dict[str, list[int]]:
+def list_cautions(root: Path, indices: Iterable[int]) -> dict[str, list[int]]:
     """What is doubtful about the mechanics of sequences, each with those of which it is."""
-    found: dict[str, list[int]] = {}
-    for key in sealed:
+    cautions: dict[str, list[int]] = {}
+    for key in indices:
         with suppress(UserError):  # damage is reported by `synth verify`
             for caution in cautions_of(open_sequence(location.store(root, key), sealed=False).attrs):
-                found.setdefault(caution, []).append(key)
-    return found
+                cautions.setdefault(caution, []).append(key)
+    return cautions
 
 
 def dataset_hash(rows: Iterable[Mapping[str, Any]]) -> str:

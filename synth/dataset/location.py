@@ -13,11 +13,11 @@ def store(root: Path, index: int) -> Path:
 
 def index_of(name: str) -> int | None:
     """The index in the name of a sealed store; None for other names."""
-    found = re.fullmatch(r"([0-9]{6}|[1-9][0-9]{6,})\.zarr", name)
-    return int(found[1]) if found else None
+    match = re.fullmatch(r"([0-9]{6}|[1-9][0-9]{6,})\.zarr", name)
+    return int(match[1]) if match else None
 
 
-def unfinished(root: Path) -> list[int]:
+def list_unfinished(root: Path) -> list[int]:
     """Indices of the stores that are being written, or were left so."""
-    found = (index_of(path.name.removesuffix(".part")) for path in root.glob("*.zarr.part"))
-    return [index for index in found if index is not None]
+    indices = (index_of(path.name.removesuffix(".part")) for path in root.glob("*.zarr.part"))
+    return [index for index in indices if index is not None]

@@ -34,15 +34,15 @@ def fingerprint() -> str:
     return word(generator())
 
 
-def compared(made_by: dict[str, str]) -> dict[str, str]:
+def select_compared(made_by: dict[str, str]) -> dict[str, str]:
     """The part of a `generator()` that decides whether two versions give the same values."""
     return {name: value for name, value in made_by.items() if name != _RECORDED}
 
 
 def word(made_by: dict[str, str]) -> str:
     """The hash of what is compared of a `generator()`, of this or another version."""
-    described = json.dumps(compared(made_by), sort_keys=True).encode()
-    return hashlib.blake2b(described, digest_size=8).hexdigest()
+    text = json.dumps(select_compared(made_by), sort_keys=True).encode()
+    return hashlib.blake2b(text, digest_size=8).hexdigest()
 
 
 def code(*folders: str, home: Path = HOME) -> str:
@@ -55,4 +55,4 @@ def code(*folders: str, home: Path = HOME) -> str:
 
 
 def _computing() -> dict[str, str]:
-    return {name: found for name, found in packages.versions().items() if name in packages.COMPUTING}
+    return {name: version for name, version in packages.versions().items() if name in packages.COMPUTING}

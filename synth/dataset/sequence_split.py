@@ -18,7 +18,7 @@ from synth.dataset.dataset_folder import write_whole
 from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
-from synth.system.config_file import validated
+from synth.system.config_file import validate_values
 
 By = Literal["anatomy", "opening", "sequence"]
 """Groups that must not be on two sides: `opening` is the craniotomy of a user's brain, else the anatomy."""
@@ -45,36 +45,36 @@ class DatasetSplit:
         """Hash of all sides."""
         return identity.digest(dict(self.sides))
 
-    def find(self, names: Iterable[str], where: Path | str) -> list[Side]:
+    def find(self, names: Iterable[str], label: Path | str) -> list[Side]:
         """The sides of sequences by their content hashes; UserError if one has none."""
-        found = [self.sides.get(name) for name in names]
-        if lost := found.count(None):
+        sides = [self.sides.get(name) for name in names]
+        if unassigned := sides.count(None):
             raise UserError(
-                f"{where}: {lost} of its {len(found)} sequences have no side in {NAME}: `synth report` "
+                f"{label}: {unassigned} of its {len(sides)} sequences have no side in {NAME}: `synth report` "
                 "assigns new sequences, `synth split` replaces the split"
             )
-        return [side for side in found if side]
+        return [side for side in sides if side]
 
 
 def read_stored(root: Path) -> DatasetSplit:
     """A dataset's `split.json`; the default without sides if it is missing. UserError if it is damaged."""
     if not os.path.lexists(root / NAME):
         return DatasetSplit()
-    return validated(DatasetSplit, checked_file.read_json(root / NAME), f"{root / NAME}: is damaged")
+    return validate_values(DatasetSplit, checked_file.read_json(root / NAME), f"{root / NAME}: is damaged")
 
 
-def store(root: Path, chosen: DatasetSplit) -> None:
+def store(root: Path, split: DatasetSplit) -> None:
     """Stores the split of the dataset in `root`."""
-    write_whole(root / NAME, json.dumps(asdict(chosen), indent=1) + "\n")
+    write_whole(root / NAME, json.dumps(asdict(split), indent=1) + "\n")
 
 
 def parse_rule(
     by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False, apart_mm: float = 0.0
 ) -> DatasetSplit:
     """A command line's split, without sides; `by` opening implies `share_anatomy`. May raise UserError."""
-    shared = share_anatomy or by == "opening"
-    given = {"by": by, "shares": shares.split(","), "held_out": held_out, "share_anatomy": shared}
-    return validated(DatasetSplit, given | {"apart_mm": apart_mm}, f"by {by}, shares {shares}")
+    sharing = share_anatomy or by == "opening"
+    values = {"by": by, "shares": shares.split(","), "held_out": held_out, "share_anatomy": sharing}
+    return validate_values(DatasetSplit, values | {"apart_mm": apart_mm}, f"by {by}, shares {shares}")
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -83,7 +83,7 @@ def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     return {side: sides.count(side) for side in SIDES if side in sides}
 
 
-def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
+def assign_sides(rows: Sequence[Mapping[str, Any]], split: DatasetSplit) -> list[Side | None]:
     """The side of every row of the index; None for a failed sequence.
 
     Sequences keep their side, and new ones get that of their group; None if it joins groups on two sides.
@@ -91,33 +91,37 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     Groups with a held-out family are in the test set. UserError: an unknown family, shares that do not sum to
     1, or fewer groups than sides.
     """
-    by, shares = chosen.by, chosen.shares
+    by, shares = split.by, split.shares
     if not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
         raise UserError(f"shares {shares}: must not be negative and must sum to 1")
     done = [row for row in rows if row["status"] == "done"]
-    unknown = set(chosen.held_out) - {str(row["family"]) for row in done}
-    if unknown and not chosen.sides:
+    unknown = set(split.held_out) - {str(row["family"]) for row in done}
+    if unknown and not split.sides:
         raise UserError(f"family {', '.join(sorted(unknown))}: no sequence has it")
-    groups, stored = _groups(done, chosen), [chosen.sides.get(row["content_hash"]) for row in done]
-    on: dict[str, set[int]] = {}
+    groups, stored = _groups(done, split), [split.sides.get(row["content_hash"]) for row in done]
+    sides_of: dict[str, set[int]] = {}
     for group, side, row in zip(groups, stored, done, strict=True):
-        on.setdefault(group, set()).update([SIDES.index(side)] if side else [])
-        on[group] |= {2} if row["family"] in chosen.held_out else set()
-    fixed = {group: max(sides) for group, sides in on.items() if sides}
+        sides_of.setdefault(group, set()).update([SIDES.index(side)] if side else [])
+        sides_of[group] |= {2} if row["family"] in split.held_out else set()
+    fixed = {group: max(sides) for group, sides in sides_of.items() if sides}
     needing = {k for k, share in enumerate(shares) if share > 0} - set(fixed.values())
-    if len(on) - len(fixed) < len(needing) and not chosen.sides:
+    if len(sides_of) - len(fixed) < len(needing) and not split.sides:
         hint = "render more sequences (`sequences` in the job)"
-        if chosen.share_anatomy and by == "opening":
+        if split.share_anatomy and by == "opening":
             hint = "list further openings in craniotomy.also of the job"
-        elif len(on) < len(done) and not chosen.share_anatomy:
+        elif len(sides_of) < len(done) and not split.share_anatomy:
             hint += ", or split within a brain by `synth split --by opening` or --share-anatomy"
-        each = [SIDES[k] for k in sorted(needing | set(fixed.values()))]
-        few = f"{len(done)} sequences form {len(on)} groups by {by}, but {len(each)} are needed"
-        raise UserError(f"{few}, one each for {', '.join(each)}: {hint}")
-    order = sorted(on, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
+        needed_sides = [SIDES[k] for k in sorted(needing | set(fixed.values()))]
+        shortage = (
+            f"{len(done)} sequences form {len(sides_of)} groups by {by}, but {len(needed_sides)} are needed"
+        )
+        raise UserError(f"{shortage}, one each for {', '.join(needed_sides)}: {hint}")
+    order = sorted(sides_of, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
     part = draw_groups(groups, shares, order, fixed)
-    dealt = [SIDES[k] if len(on[group]) < 2 else None for group, k in zip(groups, part, strict=True)]
-    sides = {row["index"]: old or new for row, old, new in zip(done, stored, dealt, strict=True)}
+    new_sides = [
+        SIDES[k] if len(sides_of[group]) < 2 else None for group, k in zip(groups, part, strict=True)
+    ]
+    sides = {row["index"]: old or new for row, old, new in zip(done, stored, new_sides, strict=True)}
     return [sides.get(row["index"]) for row in rows]
 
 
@@ -134,59 +138,61 @@ def draw_groups(
     """
     size = Counter(groups)
     part = dict(fixed or {})
-    lacking = [share * len(groups) for share in shares]
+    deficits = [share * len(groups) for share in shares]
     for group, k in part.items():
-        lacking[k] -= size[group]
+        deficits[k] -= size[group]
     open_parts = [k for k, share in enumerate(shares) if share > 0]
-    for group in sorted((one for one in order if one not in part), key=lambda one: -size[one]):
+    for group in sorted(
+        (candidate for candidate in order if candidate not in part), key=lambda candidate: -size[candidate]
+    ):
         # The part that lacks most in proportion to its share gets the next group.
-        part[group] = max(open_parts, key=lambda k: (lacking[k] / max(shares[k], 1e-9), -k))
-        lacking[part[group]] -= size[group]
+        part[group] = max(open_parts, key=lambda k: (deficits[k] / max(shares[k], 1e-9), -k))
+        deficits[part[group]] -= size[group]
     return [part[group] for group in groups]
 
 
-def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
+def assign_if_possible(rows: Sequence[Mapping[str, Any]], split: DatasetSplit) -> list[Side | None]:
     """As `assign_sides`; no sides if there are too few groups."""
     try:
-        return assign_sides(rows, chosen)
+        return assign_sides(rows, split)
     except UserError:
         return [None] * len(rows)
 
 
-def misplaced(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
+def find_misplaced(rows: Sequence[Mapping[str, Any]], split: DatasetSplit) -> list[str]:
     """Messages on sequences whose side in the index is missing or differs from the split."""
     return [
         f"sequence {row['index']} is in {row['split']}, by the split in {side}"
-        for row, side in zip(rows, assign_if_possible(rows, chosen), strict=True)
-        if row["split"] != side or (chosen.sides and row["status"] == "done" and side is None)
+        for row, side in zip(rows, assign_if_possible(rows, split), strict=True)
+        if row["split"] != side or (split.sides and row["status"] == "done" and side is None)
     ]
 
 
-def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit = DatasetSplit()) -> list[str]:
+def find_leaks(rows: Sequence[Mapping[str, Any]], split: DatasetSplit = DatasetSplit()) -> list[str]:
     """Messages on anatomies and contents on more than one side, and on held-out families in training."""
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
-    found = [
+    messages = [
         f"family {row['family']} is held out and in {row['split']}"
         for row in done
-        if row["split"] in SIDES[:2] and row["family"] in chosen.held_out
+        if row["split"] in SIDES[:2] and row["family"] in split.held_out
     ]
     keys = {"content_hash": [row["content_hash"] for row in done]}
-    if not chosen.share_anatomy:
+    if not split.share_anatomy:
         keys = {"anatomy": [row["anatomy"] for row in done], **keys}
-    elif chosen.by == "opening":
-        keys = {"opening": _groups(done, chosen), **keys}
+    elif split.by == "opening":
+        keys = {"opening": _groups(done, split), **keys}
     for name, values in keys.items():
         crossing = find_crossings(values, [row["split"] for row in done])
-        found += [f"{name} {key} is in {', '.join(on)}" for key, on in crossing.items()]
-    return found
+        messages += [f"{name} {key} is in {', '.join(sides)}" for key, sides in crossing.items()]
+    return messages
 
 
 def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:
     """Groups on more than one side, with those sides. `groups` and `sides` have one entry per sequence."""
-    on: dict[Hashable, set[str]] = {}
+    sides_of: dict[Hashable, set[str]] = {}
     for group, side in zip(groups, sides, strict=True):
-        on.setdefault(group, set()).add(side)
-    return {group: sorted(found) for group, found in on.items() if len(found) > 1}
+        sides_of.setdefault(group, set()).add(side)
+    return {group: sorted(group_sides) for group, group_sides in sides_of.items() if len(group_sides) > 1}
 
 
 def join_groups(*keys: Sequence[Hashable]) -> list[int]:
@@ -203,9 +209,9 @@ def join_groups(*keys: Sequence[Hashable]) -> list[int]:
             group[k] = k = group[group[k]]
         return k
 
-    for which, values in enumerate(keys):
+    for kind, values in enumerate(keys):
         for k, value in enumerate(values):
-            low, high = sorted((root(k), root(first.setdefault((which, value), k))))
+            low, high = sorted((root(k), root(first.setdefault((kind, value), k))))
             group[high] = low
     return [root(k) for k in range(len(group))]
 
@@ -215,31 +221,31 @@ def name_anatomy(attrs: Mapping[str, Any]) -> str:
     return str(attrs.get("anatomy_id") or attrs["content_hash"])
 
 
-def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
+def _groups(rows: Sequence[Mapping[str, Any]], split: DatasetSplit) -> list[str]:
     """The group of every row; groups that share an anatomy are merged unless the rule allows sharing."""
-    if chosen.by == "opening":
-        names = _join_openings([str(row.get("opening") or row["anatomy"]) for row in rows], chosen.apart_mm)
+    if split.by == "opening":
+        names = _join_openings([str(row.get("opening") or row["anatomy"]) for row in rows], split.apart_mm)
     else:
-        names = [str(row["content_hash" if chosen.by == "sequence" else "anatomy"]) for row in rows]
-    if chosen.share_anatomy:
+        names = [str(row["content_hash" if split.by == "sequence" else "anatomy"]) for row in rows]
+    if split.share_anatomy:
         return names
-    joined, first = join_groups(names, [row["anatomy"] for row in rows]), dict[int, str]()
-    for group, name in zip(joined, names, strict=True):
+    numbers, first = join_groups(names, [row["anatomy"] for row in rows]), dict[int, str]()
+    for group, name in zip(numbers, names, strict=True):
         first[group] = min(name, first.get(group, name))
-    return [first[group] for group in joined]
+    return [first[group] for group in numbers]
 
 
 def _join_openings(names: Sequence[str], apart_mm: float) -> list[str]:
     """Names of openings (of `synth.job.identity`), with one name for those of a brain that overlap."""
-    placed = sorted({name for name in names if " at " in name})
-    if not placed:
+    located = sorted({name for name in names if " at " in name})
+    if not located:
         return list(names)
-    brains, places = zip(*(name.split(" at ") for name in placed), strict=True)
+    brains, places = zip(*(name.split(" at ") for name in located), strict=True)
     from scipy.sparse.csgraph import connected_components  # of brains of users alone
     from scipy.spatial.distance import cdist
 
-    apart = cdist(*[np.array([place.split(",") for place in places], float)] * 2)
-    same = np.array(brains)[:, None] == np.array(brains)
-    part = connected_components(same & (apart < apart_mm))[1].tolist()
-    joined = {name: placed[part.index(k)] for name, k in zip(placed, part, strict=True)}
-    return [joined.get(name, name) for name in names]
+    distance_mm = cdist(*[np.array([place.split(",") for place in places], float)] * 2)
+    same_brain = np.array(brains)[:, None] == np.array(brains)
+    part = connected_components(same_brain & (distance_mm < apart_mm))[1].tolist()
+    merged = {name: located[part.index(k)] for name, k in zip(located, part, strict=True)}
+    return [merged.get(name, name) for name in names]

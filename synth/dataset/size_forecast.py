@@ -36,9 +36,11 @@ def forecast_rest(
     job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None
 ) -> Forecast:
     """Forecast of `todo` more sequences, from the finished ones `done`; `cpu_s`: of one sequence [s]."""
-    some = pilot(done)
-    each = np.mean([folder_bytes(location.store(root, key)) for key in some]) if some else estimate(job)
-    return Forecast(todo, float(each) * todo, None if cpu_s is None else cpu_s * todo, len(some))
+    pilots = pilot(done)
+    sequence_bytes = (
+        np.mean([folder_bytes(location.store(root, key)) for key in pilots]) if pilots else estimate(job)
+    )
+    return Forecast(todo, float(sequence_bytes) * todo, None if cpu_s is None else cpu_s * todo, len(pilots))
 
 
 def pilot(done: Sequence[int]) -> list[int]:
@@ -55,8 +57,8 @@ def field_bytes(field: Field, frames: int, size: tuple[int, int], half: bool = F
 def estimate(job: Job) -> float:
     """Bytes of one sequence of `job` on disk, from the field table."""
     width, height = job.render.size
-    how = job.frames, (height, width), job.store.flow == "float16"
-    return _MARGIN * sum(field_bytes(FIELDS[name], *how)[1] for name in job.stored_fields)
+    layout = job.frames, (height, width), job.store.flow == "float16"
+    return _MARGIN * sum(field_bytes(FIELDS[name], *layout)[1] for name in job.stored_fields)
 
 
 def estimate_memory(job: Job) -> float:
@@ -67,8 +69,8 @@ def estimate_memory(job: Job) -> float:
     width, height = job.render.size
     pixels = width * height * (2 if job.render.stereo_mm else 1)
     video = _VIDEO_BYTES + (_FLOW_BYTES if job.flow.backend != "ideal" else 0)
-    each = _MOTION_BYTES * job.anatomy.vertices + video * pixels
-    return _MARGIN * (_PROGRAM_BYTES + _STAGE_BYTES * pixels + each * job.frames)
+    frame_bytes = _MOTION_BYTES * job.anatomy.vertices + video * pixels
+    return _MARGIN * (_PROGRAM_BYTES + _STAGE_BYTES * pixels + frame_bytes * job.frames)
 
 
 def refuse_if_too_long(job: Job, worker_bytes: int, workers: int) -> None:

@@ -49,7 +49,7 @@ class Writer:
         self._writers: dict[str, _FieldWriter] = {}
         self._wanted = job.stored_fields
         self._half = job.store.flow == "float16"
-        self._own = {
+        self._attributes = {
             "format": FORMAT,
             "format_version": STORE,
             "index": index,
@@ -64,7 +64,7 @@ class Writer:
     @property
     def job_identity(self) -> str:
         """Identity of its job, by the job's files as they are now."""
-        return str(self._own["job"])
+        return str(self._attributes["job"])
 
     def wants(self, name: str) -> bool:
         """Whether the job stores that field; `put` ignores others."""
@@ -94,16 +94,18 @@ class Writer:
         `attributes`: JSON-ready; only `timings` may differ between equal sequences. Returns the final path.
         """
         for name in self._wanted:
-            written = self._writers.get(name)
-            if written is None or written.filled != written.shape[0]:
-                raise ValueError(f"{name}: only {written.filled if written else 0} frames were written")
+            writer = self._writers.get(name)
+            if writer is None or writer.filled != writer.shape[0]:
+                raise ValueError(f"{name}: only {writer.filled if writer else 0} frames were written")
         hashes = {name: self._writers[name].hash.hexdigest() for name in FIELDS if name in self._writers}
         peaks = {key: self._writers[name].largest for name, key in _PEAKS.items() if name in self._writers}
         summary: dict[str, Any] = peaks
         if self._half:
-            summary["rounding_px"] = {k: one.rounding for k, one in self._writers.items() if FIELDS[k].half}
+            summary["rounding_px"] = {
+                k: writer.rounding for k, writer in self._writers.items() if FIELDS[k].half
+            }
         attrs = {
-            **self._own,
+            **self._attributes,
             **attributes,
             "summary": summary,
             "field_hashes": hashes,
@@ -172,18 +174,18 @@ class _FieldWriter:
         self._array[...] = self._accept(array, self.shape, "")
         self.filled = self.shape[0]
 
-    def _accept(self, array: Array, shape: tuple[int, ...], where: str) -> Array:
+    def _accept(self, array: Array, shape: tuple[int, ...], suffix: str) -> Array:
         """A checked copy of a frame or field, as stored; adds it to the hash and the greatest length."""
         name, dtype = self._field.name, self._dtype
         array = np.asarray(array)
         if array.shape != shape:
-            raise ValueError(f"{name}{where}: shape {array.shape}, the field table has {shape}")
+            raise ValueError(f"{name}{suffix}: shape {array.shape}, the field table has {shape}")
         if not np.can_cast(array.dtype, dtype, "same_kind"):
-            raise ValueError(f"{name}{where}: {array.dtype}, the field table has {dtype}")
+            raise ValueError(f"{name}{suffix}: {array.dtype}, the field table has {dtype}")
         # A copy, since the caller may reuse its buffer before the shard is full.
         copy = np.array(array, dtype, order="C")
         if dtype.kind == "f" and not np.isfinite(copy).all():
-            raise NotFinite(f"{name}{where}: not finite, first at {np.argwhere(~np.isfinite(copy))[0]}")
+            raise NotFinite(f"{name}{suffix}: not finite, first at {np.argwhere(~np.isfinite(copy))[0]}")
         if self._field.half and copy.dtype != array.dtype:
             self.rounding = max(self.rounding, float(np.abs(copy - array).max()))
         self.hash.update(copy.data)
@@ -196,8 +198,8 @@ class _FieldWriter:
 class FieldReader:
     """A field of a sealed sequence, read when indexed. UserError, with store and field, if it is damaged."""
 
-    def __init__(self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path) -> None:
-        self._array, self._where = array, where
+    def __init__(self, array: zarr.Array[Any], dtype: np.dtype[Any], label: str, folder: Path) -> None:
+        self._array, self._label = array, label
         self._shards = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype  # type on disk; values are returned in the table's type
@@ -216,7 +218,7 @@ class FieldReader:
         except IndexError:
             raise
         except Exception as error:  # Zarr, its codecs and the file system raise various errors for damage
-            raise UserError(f"{self._where}: cannot be read, the store is damaged ({error})") from error
+            raise UserError(f"{self._label}: cannot be read, the store is damaged ({error})") from error
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.asarray(self[...], dtype)
@@ -282,44 +284,44 @@ class Sequence:
             UserError: a value is outside the table's limits or not finite; or, after the last frame, the
             values have changed since the seal.
         """
-        field, found = _field(name), self[name]
-        where = f"{self.path}: {name}"
-        hasher = field_hasher(name, found.stored, found.shape)
-        every: Any = range(len(found)) if field.framed else [...]
-        for part in every:
-            values = np.ascontiguousarray(found[part])
+        field, reader = _field(name), self[name]
+        label = f"{self.path}: {name}"
+        hasher = field_hasher(name, reader.stored, reader.shape)
+        selections: Any = range(len(reader)) if field.framed else [...]
+        for selection in selections:
+            values = np.ascontiguousarray(reader[selection])
             if values.dtype.kind == "f" and values.size:
                 low, high = float(values.min()), float(values.max())  # both are NaN where one value is
                 if not np.isfinite(low + high):
-                    raise UserError(f"{where}: contains values that are not finite")
+                    raise UserError(f"{label}: contains values that are not finite")
                 if (field.low is not None and low < field.low) or (
                     field.high is not None and high > field.high
                 ):
-                    raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} are out of range")
-            hasher.update(values.astype(found.stored, copy=False).data)
+                    raise UserError(f"{label}: values from {low:g} to {high:g} {field.unit} are out of range")
+            hasher.update(values.astype(reader.stored, copy=False).data)
             yield values
         if hasher.hexdigest() != self.attrs["field_hashes"][name]:
-            raise UserError(f"{where}: values were changed after the seal; run `synth verify`")
+            raise UserError(f"{label}: values were changed after the seal; run `synth verify`")
 
     def __getitem__(self, name: str) -> FieldReader:
-        field, where = _field(name), f"{self.path}: {name}"
+        field, label = _field(name), f"{self.path}: {name}"
         if name not in self:
             hint = "; it was made without mechanics.force" if name in ("force", "traction") else ""
-            raise UserError(f"{where}: the sequence has no such field{hint}")
+            raise UserError(f"{label}: the sequence has no such field{hint}")
         try:
             array = self._group[name]
         except Exception as error:  # as in FieldReader
-            raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
+            raise UserError(f"{label}: cannot be opened, the store is damaged ({error})") from error
         expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
         types = (dtype, np.dtype("float16")) if field.half else (dtype,)
         if not isinstance(array, zarr.Array) or array.shape != expected or array.dtype not in types:
-            raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
+            raise UserError(f"{label}: is not {field.dtype} {expected}, the store is damaged")
         rest = "/0" * (len(expected) - 1)
         for k in range(-(-expected[0] // (array.shards or array.chunks)[0])):
             # Zarr reads a missing or empty file as zeros.
             if not _size(self.path / f"{name}/c/{k}{rest}"):
-                raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return FieldReader(array, dtype, where, self.path / name)
+                raise UserError(f"{label}: file c/{k}{rest} is missing or empty, the store is damaged")
+        return FieldReader(array, dtype, label, self.path / name)
 
 
 class Dataset:
@@ -375,8 +377,8 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
 
 def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
     """A hasher that has been fed the stored name, type and shape, for the values in C order."""
-    described = identity.canonical([name, str(stored), list(shape)])
-    return hashlib.blake2b(described, digest_size=16)
+    header = identity.canonical([name, str(stored), list(shape)])
+    return hashlib.blake2b(header, digest_size=16)
 
 
 def content_hash(attrs: Mapping[str, Any]) -> str:

@@ -64,8 +64,8 @@ class TorchDataset:
         Raises:
             UserError: not a dataset, no such side, or a sequence lacks a field or is shorter than a clip.
         """
-        named = (fields,) if isinstance(fields, str) else fields
-        if unknown := [name for name in named or () if name not in FIELDS]:
+        names = (fields,) if isinstance(fields, str) else fields
+        if unknown := [name for name in names or () if name not in FIELDS]:
             hint = did_you_mean(unknown[0], FIELDS)
             raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}{hint}")
         self._dataset = Dataset(root)
@@ -84,22 +84,22 @@ class TorchDataset:
             if split not in sides:
                 raise UserError(f"split: {split!r}: {root} has {', '.join(sides)}")
             sequences = sides[split]
-        self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
-        if not all(0 <= position < len(self._dataset) for position in self._chosen):
+        self._positions = tuple(range(len(self._dataset)) if sequences is None else sequences)
+        if not all(0 <= position < len(self._dataset) for position in self._positions):
             raise UserError(f"sequences: the dataset has positions 0 to {len(self._dataset) - 1}")
-        every = [self._dataset[position] for position in self._chosen]
-        common = (name for name in FIELDS if all(name in sequence for sequence in every))
-        self._fields, self._ends = tuple(common if named is None else named), list[int]()
-        needed = (max(clip, 1) - 1) * stride + 1
-        for sequence in every:
+        stores = [self._dataset[position] for position in self._positions]
+        common = (name for name in FIELDS if all(name in sequence for sequence in stores))
+        self._fields, self._ends = tuple(common if names is None else names), list[int]()
+        clip_frames = (max(clip, 1) - 1) * stride + 1
+        for sequence in stores:
             if missing := [name for name in self._fields if name not in sequence]:
                 raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
-            if sequence.frames < needed:
-                apart = f" with stride={stride}" if stride > 1 else ""
+            if sequence.frames < clip_frames:
+                gap = f" with stride={stride}" if stride > 1 else ""
                 raise UserError(
-                    f"{sequence.path}: has {sequence.frames} frames, fewer than clip={clip}{apart} needs"
+                    f"{sequence.path}: has {sequence.frames} frames, fewer than clip={clip}{gap} needs"
                 )
-            self._ends.append(len(self) + 1 + (sequence.frames - needed) // step)
+            self._ends.append(len(self) + 1 + (sequence.frames - clip_frames) // step)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -110,14 +110,17 @@ class TorchDataset:
         if not -len(self) <= number < len(self):
             raise IndexError(f"{number}: there are {len(self)} items")
         number %= len(self)
-        which = bisect_right(self._ends, number)
-        frame = self._step * (number - (self._ends[which - 1] if which else 0))
-        sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)
+        slot = bisect_right(self._ends, number)
+        frame = self._step * (number - (self._ends[slot - 1] if slot else 0))
+        sequence, readers = _open(os.getpid(), self._dataset, self._positions[slot], self._fields)
         last = frame + self._stride * (self._clip - 1) + 1
-        at = slice(frame, last, self._stride) if self._clip else frame
-        values = {name: one[at] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
-        found: dict[str, Any] = {"index": sequence.index, "frame": frame, **values}
+        selection = slice(frame, last, self._stride) if self._clip else frame
+        values = {
+            name: reader[selection] if reader.dims[0] == TIME else reader[:]
+            for name, reader in readers.items()
+        }
+        sample: dict[str, Any] = {"index": sequence.index, "frame": frame, **values}
         for name in ("scale_mm_per_px", "young_kpa"):
-            stated = sequence.attrs.get(name)
-            found[name] = math.nan if stated is None else float(stated)
-        return found if self._transform is None else self._transform(found)
+            value = sequence.attrs.get(name)
+            sample[name] = math.nan if value is None else float(value)
+        return sample if self._transform is None else self._transform(sample)

@@ -87,19 +87,19 @@ class Child:
         self._process = None
 
     def _start(self) -> subprocess.Popen[bytes]:
-        self._pipe, theirs = os.pipe()
+        self._pipe, child_end = os.pipe()
         lock = self._setup.lock_fd
         process = subprocess.Popen(
-            [sys.executable, "-m", "synth.engine.worker", str(theirs)],
+            [sys.executable, "-m", "synth.engine.worker", str(child_end)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            pass_fds=(theirs,) if lock is None else (theirs, lock),
+            pass_fds=(child_end,) if lock is None else (child_end, lock),
             env={**os.environ, **self._setup.environment},
             # Ctrl-C in the terminal goes to the engine only, which then ends its workers in order.
             start_new_session=True,
         )
-        os.close(theirs)
+        os.close(child_end)
         self._unread, self._finished = b"", 0
         _write(process, json.dumps(asdict(self._setup), default=str))
         return process
@@ -120,7 +120,7 @@ class Child:
                     return Attempt(index, message["failed"], message["reason"], self._log(index))
                 report(message["stage"], message["done"], message["of"])
             if messages is None:
-                return Attempt(index, "crash", _ending(process.wait()), self._log(index))
+                return Attempt(index, "crash", _describe_exit(process.wait()), self._log(index))
             if limit is not None and _memory(process.pid) > limit:
                 reason = f"used more than {limit / 1e9:.3g} GB of memory"
                 return Attempt(index, "memory", reason, self._log(index))
@@ -156,7 +156,7 @@ def _memory(pid: int) -> int:
     return 0
 
 
-def _ending(code: int) -> str:
+def _describe_exit(code: int) -> str:
     if code >= 0:
         return f"the process exited with code {code}"
     name = signal.Signals(-code).name
@@ -164,19 +164,19 @@ def _ending(code: int) -> str:
     return f"the process died of {name}{hint}"
 
 
-def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
+def choose_gpus(option: str, needed: bool) -> tuple[str, ...] | None:
     """Names of the GPUs that workers share, for CUDA_VISIBLE_DEVICES; None: it is not set.
 
-    `chosen`: `auto` (only if `wanted`), `none` or names separated by commas. UserError for a GPU not there.
+    `option`: `auto` (only if `needed`), `none` or names separated by commas. UserError for a GPU not there.
     """
-    if chosen == "none":
+    if option == "none":
         return ()
-    if chosen == "auto":
-        return (gpu.visible() or None) if wanted else None
-    named, here = tuple(word.strip() for word in chosen.split(",")), gpu.visible()
-    if missing := [name for name in named if name not in here]:
-        raise UserError(f"--gpus {', '.join(missing)}: this machine has {', '.join(here) or 'none'}")
-    return named
+    if option == "auto":
+        return (gpu.visible() or None) if needed else None
+    names, available = tuple(word.strip() for word in option.split(",")), gpu.visible()
+    if missing := [name for name in names if name not in available]:
+        raise UserError(f"--gpus {', '.join(missing)}: this machine has {', '.join(available) or 'none'}")
+    return names
 
 
 def environment(job: Job, workers: int) -> dict[str, str]:
@@ -185,10 +185,10 @@ def environment(job: Job, workers: int) -> dict[str, str]:
     library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
     home = str(Path(synth.__file__).resolve().parents[1])
     path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
-    own = {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or "", "PYTHONPATH": path}
+    variables = {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or "", "PYTHONPATH": path}
     # One thread per numerical library: more slow each other down, and their number must not change a sum.
-    single = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
-    return {**own, "PYTHONHASHSEED": "0", **{f"{name}_NUM_THREADS": "1" for name in single}}
+    libraries = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
+    return {**variables, "PYTHONHASHSEED": "0", **{f"{name}_NUM_THREADS": "1" for name in libraries}}
 
 
 def share_of_memory(workers: int) -> int:

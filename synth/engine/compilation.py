@@ -26,35 +26,38 @@ def compile_once(environment: Mapping[str, str], processes: int, tell: Callable[
     `environment`: added to that of the processes; `tell` is called with a line of text before it begins.
     """
     with suppress(OSError):  # nowhere to store anything: workers compile for themselves
-        done = cache.folder("loops") / f"compiled-{_key()}"
-        if done.exists():
+        marker = cache.folder("loops") / f"compiled-{_key()}"
+        if marker.exists():
             return
         parts = min(processes, _MOST)
         tell(f"compiling the program's loops once, about {round(_ALL_S / parts + 3)} s")
-        call, variables = [sys.executable, "-m", "synth.engine.compilation"], {**os.environ, **environment}
-        running: list[subprocess.Popen[bytes]] = []
+        program, child_environment = (
+            [sys.executable, "-m", "synth.engine.compilation"],
+            {**os.environ, **environment},
+        )
+        children: list[subprocess.Popen[bytes]] = []
         try:
             for part in range(parts):
-                words = [*call, str(part), str(parts)]
-                running.append(subprocess.Popen(words, env=variables, stdout=subprocess.DEVNULL))
-            codes = [process.wait() for process in running]
+                words = [*program, str(part), str(parts)]
+                children.append(subprocess.Popen(words, env=child_environment, stdout=subprocess.DEVNULL))
+            codes = [process.wait() for process in children]
         finally:
-            for process in running:
+            for process in children:
                 process.kill()
                 process.wait()
         if not any(codes):  # else workers compile what is missing, and report what is wrong
-            done.touch()
+            marker.touch()
 
 
 def _key() -> str:
     """A word for all that numba's own cache depends on."""
-    about = (
+    versions = (
         packages.versions(),
         target_processor.target(),
         str(provenance.HOME),
         os.environ.get("NUMBA_CACHE_DIR"),
     )
-    return hashlib.sha256(repr((provenance.code("synth"), *about)).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr((provenance.code("synth"), *versions)).encode()).hexdigest()[:16]
 
 
 if __name__ == "__main__":

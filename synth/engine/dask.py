@@ -43,7 +43,9 @@ def open_slots(engine: str, setup: Setup) -> Iterator[list[Child]]:
     except ImportError:
         raise UserError(f"a Dask engine {_LACKING}") from None
     # The lock can't be sent to other machines; workers detect the end of their run by the turn.
-    sent = replace(setup, lock_fd=None, environment={}, memory_bytes=None, generator=provenance.fingerprint())
+    remote_setup = replace(
+        setup, lock_fd=None, environment={}, memory_bytes=None, generator=provenance.fingerprint()
+    )
     with _cluster(engine) as (address, expected, security):
         try:
             client = distributed.Client(address, timeout=_CONNECT, security=security)
@@ -57,7 +59,7 @@ def open_slots(engine: str, setup: Setup) -> Iterator[list[Child]]:
             except TimeoutError:
                 raise UserError(f"{engine}: no worker has joined") from None
             # At least one slot waits, even if the last worker has just left.
-            yield [_DaskSlot(client, sent)] * max(sum(client.nthreads().values()), expected, 1)
+            yield [_DaskSlot(client, remote_setup)] * max(sum(client.nthreads().values()), expected, 1)
 
 
 class _DaskSlot(Child):
@@ -104,9 +106,9 @@ def _child(setup: Setup, threads: int) -> Child:
     if getattr(_thread, "setup", None) != setup:
         if hasattr(_thread, "child"):
             _thread.child.close()
-        here = environment(Job.model_validate(setup.job), threads)
-        local = replace(setup, environment=here, memory_bytes=share_of_memory(threads))
-        _thread.setup, _thread.child = setup, Child(local)
+        variables = environment(Job.model_validate(setup.job), threads)
+        local_setup = replace(setup, environment=variables, memory_bytes=share_of_memory(threads))
+        _thread.setup, _thread.child = setup, Child(local_setup)
     child: Child = _thread.child
     return child
 
@@ -123,27 +125,27 @@ def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Even
 @contextmanager
 def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
     """Yields the scheduler's address, the expected number of slots, and certificates if not configured."""
-    described = engine if engine.startswith(("dask://", "tls://")) else read_slurm(Path(engine))
-    if who := open_to(described):
-        print(f"note: {who}: anyone in that network can run code there", file=sys.stderr)
-    if isinstance(described, str):
-        yield described.replace("dask://", "tcp://", 1), 0, None
+    target = engine if engine.startswith(("dask://", "tls://")) else read_slurm(Path(engine))
+    if risk := describe_risk(target):
+        print(f"note: {risk}: anyone in that network can run code there", file=sys.stderr)
+    if isinstance(target, str):
+        yield target.replace("dask://", "tcp://", 1), 0, None
         return
-    jobs = int(described.pop("jobs"))
+    jobs = int(target.pop("jobs"))
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise UserError(f"a SLURM engine {_LACKING}") from None
     try:
-        cluster = SLURMCluster(**described)  # no job is submitted yet
+        cluster = SLURMCluster(**target)  # no job is submitted yet
     except (TypeError, ValueError) as error:
         raise UserError(f"{engine}: is not accepted by dask-jobqueue ({error})") from error
     with cluster:
         cluster.scale(jobs=jobs)
-        yield cluster.scheduler_address, jobs * int(described["cores"]), cluster.security
+        yield cluster.scheduler_address, jobs * int(target["cores"]), cluster.security
 
 
-def open_to(cluster: str | dict[str, Any]) -> str:
+def describe_risk(cluster: str | dict[str, Any]) -> str:
     """A warning if others could run code on a cluster, else empty. UserError: no host or port."""
     if isinstance(cluster, str):
         kind, _, place = cluster.partition("://")
@@ -153,9 +155,9 @@ def open_to(cluster: str | dict[str, Any]) -> str:
         local = host in ("localhost", "[::1]") or host.startswith("127.")
         return "" if kind == "tls" or local else f"{host} is reached unencrypted (tls://... is not)"
     scheduler = cluster.get("scheduler_options")
-    stated = {*cluster, *(scheduler if isinstance(scheduler, dict) else ())}
+    keys = {*cluster, *(scheduler if isinstance(scheduler, dict) else ())}
     risks = {
-        "the scheduler listens on every interface (`interface:`)": not {"interface", "host"} & stated,
+        "the scheduler listens on every interface (`interface:`)": not {"interface", "host"} & keys,
         "it is reached unencrypted (`security: true`)": not cluster.get("security"),
     }
     return " and ".join(risk for risk, holds in risks.items() if holds)
@@ -165,9 +167,9 @@ def read_slurm(path: Path) -> dict[str, Any]:
     """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file without them."""
     if not os.path.lexists(path):
         raise UserError(f"{path}: is neither local, dask://host:port, tls://host:port nor a file")
-    found = checked_file.read_yaml(path)
-    if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
+    config = checked_file.read_yaml(path)
+    if not isinstance(config, dict) or not isinstance(config.get("jobs"), int) or config["jobs"] < 1:
         raise UserError(f"{path}: must contain `jobs`, the number of jobs to submit")
-    if missing := {"cores", "memory"} - found.keys():
+    if missing := {"cores", "memory"} - config.keys():
         raise UserError(f"{path}: must contain {' and '.join(sorted(missing))} of a job")
-    return dict(found)
+    return dict(config)

@@ -77,7 +77,7 @@ class Journal(Watcher):
         if self._cold <= 0:
             self._ends.append(at_s)
 
-    def left_s(self) -> float | None:
+    def estimate_left_s(self) -> float | None:
         """Seconds to the end, by the latest sequences; None until there are enough."""
         count = len(self._ends) - 1
         return (self._ends[-1] - self._ends[0]) / count * self._left if count > 0 else None
@@ -87,7 +87,9 @@ class Journal(Watcher):
         if self._left and now - self._written < _EVERY_S:
             return
         self._written = now
-        progress = RunProgress(self.left_s(), {str(k): at for k, at in sorted(self._in_flight.items())})
+        progress = RunProgress(
+            self.estimate_left_s(), {str(k): steps for k, steps in sorted(self._in_flight.items())}
+        )
         write_whole(self._path, json.dumps(asdict(progress)), durable=False)
         self._report(progress)
 
@@ -121,17 +123,19 @@ class RunBars(ProgressBars, Watcher):
         if attempt.kind == "stopped":
             return
         if attempt.kind != "done":
-            what = "is retried" if again else "failed"
-            self._print(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
+            outcome = "is retried" if again else "failed"
+            self._print(f"sequence {attempt.index:06d} {outcome}: {attempt.reason}")
         if again:
             return
         self.advance(self._dataset)
-        whole = next(task for task in self.tasks if task.id == self._dataset)
-        quiet = time.monotonic() - self._printed < _QUIET_S and not whole.finished
+        dataset_task = next(task for task in self.tasks if task.id == self._dataset)
+        quiet = time.monotonic() - self._printed < _QUIET_S and not dataset_task.finished
         if self.disable and not quiet:
             self._printed = time.monotonic()
-            spent = ", ".join(filter(None, (f"{clock(whole.elapsed or 0.0)} spent", whole.fields["left"])))
-            self._print(f"{whole.completed:.0f} of {whole.total:.0f} sequences, {spent}")
+            times = ", ".join(
+                filter(None, (f"{clock(dataset_task.elapsed or 0.0)} spent", dataset_task.fields["left"]))
+            )
+            self._print(f"{dataset_task.completed:.0f} of {dataset_task.total:.0f} sequences, {times}")
 
     def account(self, progress: RunProgress) -> None:
         left = "" if progress.left_s is None else f"{clock(progress.left_s)} left"

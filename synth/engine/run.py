@@ -85,11 +85,11 @@ def render_job(
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
     """
     job = as_job(job)
-    chosen = checked(Options)(**options)
+    run_options = checked(Options)(**options)
     if progress is True:
         with RunBars() as bars:
-            return run_job(job, Path(out), chosen, bars)
-    return run_job(job, Path(out), chosen, progress or Watcher())
+            return run_job(job, Path(out), run_options, bars)
+    return run_job(job, Path(out), run_options, progress or Watcher())
 
 
 def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
@@ -107,14 +107,14 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         refuse_unfit(job.render)
     gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions, part=options.part) as folder:
-        mine = [index for index in range(job.sequences) if folder.computes(index)]
-        finished = [index for index in folder.sealed() if folder.computes(index)]
-        failures = {index: one for index, one in folder.failures().items() if folder.computes(index)}
-        todo = sorted(set(mine) - set(finished) - set(failures))
+        indices = [index for index in range(job.sequences) if folder.computes(index)]
+        finished = [index for index in folder.list_sealed() if folder.computes(index)]
+        failures = {index: failure for index, failure in folder.failures().items() if folder.computes(index)}
+        todo = sorted(set(indices) - set(finished) - set(failures))
         size_forecast.refuse_if_too_large(size_forecast.forecast_rest(job, root, len(todo), finished), root)
         watchers = (Journal(folder, workers, watcher.account), watcher)
-        for one in watchers:
-            one.begin(len(mine), len(finished), len(failures))
+        for observer in watchers:
+            observer.begin(len(indices), len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root.resolve(),
@@ -133,15 +133,17 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             rows = _complete(folder, job)
         if folder.part is None and (done or not (root / "README.md").exists()):
             card.write_card(folder)
-        made = [key for key in folder.sealed() if folder.computes(key)]
-        failed = {key: one["reason"] for key, one in folder.failures().items() if folder.computes(key)}
+        completed = [key for key in folder.list_sealed() if folder.computes(key)]
+        failed = {
+            key: failure["reason"] for key, failure in folder.failures().items() if folder.computes(key)
+        }
         return Summary(
-            total=len(mine),
+            total=len(indices),
             already=len(finished),
             done=done,
             failed=failed,
             content_hash="" if rows is None else index.dataset_hash(rows),
-            cautions={} if job.mechanics.source is None else index.list_cautions(root, made),
+            cautions={} if job.mechanics.source is None else index.list_cautions(root, completed),
         )
 
 
@@ -154,7 +156,7 @@ def _complete(folder: Folder, job: Job) -> list[dict[str, Any]] | None:
     if folder.part is None:
         return index.write_index(folder)
     with folder.gate():
-        if set(range(job.sequences)) - set(folder.sealed()) - set(folder.failures()):
+        if set(range(job.sequences)) - set(folder.list_sealed()) - set(folder.failures()):
             return None
         rows = index.write_index(folder)
         card.write_card(folder)
@@ -173,20 +175,20 @@ def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
     Raises:
         UserError: the folder is not for this job.
     """
-    mine: BaseException | None = None
+    block_error: BaseException | None = None
     try:
         with claim(Path(root), as_job(job)) as folder:
             try:
                 yield folder.root
             except BaseException as error:
-                mine = error
+                block_error = error
                 raise
             finally:
                 index.write_index(folder)
             card.write_card(folder)
     except BaseException:
-        if mine is not None:  # not that of the cleaning after it
-            raise mine from mine.__cause__
+        if block_error is not None:  # not that of the cleaning after it
+            raise block_error from block_error.__cause__
         raise
 
 
@@ -257,17 +259,17 @@ class _Pool:
         if attempt.kind == "disk":
             raise UserError(f"{self._folder.root}: cannot be written ({attempt.reason})")
         self._done += attempt.kind == "done"
-        again = attempt.kind not in ("done", "input", "stopped") and tries < _TRIES
-        if again:
+        retry = attempt.kind not in ("done", "input", "stopped") and tries < _TRIES
+        if retry:
             self._folder.sweep(attempt.index)
         elif attempt.kind not in ("done", "stopped"):
             self._fail(attempt, tries)
         with self._change:
-            if again:
+            if retry:
                 self._todo.append((attempt.index, tries + 1))
             self._busy -= 1
             self._change.notify_all()
-        self._events.put(lambda watcher: watcher.end(attempt, again))
+        self._events.put(lambda watcher: watcher.end(attempt, retry))
 
     def _fail(self, attempt: Attempt, tries: int) -> None:
         self._folder.mark_failed({**asdict(attempt), "tries": tries})
@@ -275,9 +277,9 @@ class _Pool:
             return
         with self._change:
             self._refused.append(attempt)
-            left = self._done + len(self._todo) + self._busy - 1
-            hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
-        if hopeless and not self._folder.sealed():
+            remaining = self._done + len(self._todo) + self._busy - 1
+            hopeless = not self._done and (len(self._refused) >= _VERDICT or not remaining)
+        if hopeless and not self._folder.list_sealed():
             # The job itself is at fault: leave nothing behind.
             self._folder.clear_failures(refused.index for refused in self._refused)
             raise UserError("\n".join(sorted({refused.reason for refused in self._refused})))
@@ -289,9 +291,12 @@ def _slots(
 ) -> Iterator[Sequence[Child]]:
     """The slots of an engine; each of this machine's has one of `gpus` in turn, or all."""
     if engine == "local":
-        names = [] if gpus is None else [{"CUDA_VISIBLE_DEVICES": name} for name in gpus or ("",)]
-        own = islice(cycle(names or [{}]), workers)
-        yield [Child(replace(setup, environment={**setup.environment, **one})) for one in own]
+        settings = [] if gpus is None else [{"CUDA_VISIBLE_DEVICES": name} for name in gpus or ("",)]
+        environments = islice(cycle(settings or [{}]), workers)
+        yield [
+            Child(replace(setup, environment={**setup.environment, **variables}))
+            for variables in environments
+        ]
         return
     from synth.engine import dask
 

@@ -16,7 +16,7 @@ from synth.dataset.store import open_sequence
 from synth.engine.journal import RunProgress
 from synth.errors import UserError
 from synth.system import checked_file, file_lock
-from synth.system.config_file import validated
+from synth.system.config_file import validate_values
 from synth.system.terminal import clock
 
 
@@ -38,7 +38,7 @@ class Status:
 def read_status(root: Path) -> Status:
     """The status of the dataset in `root`. UserError if there is none."""
     folder = Folder(root)
-    job, done, failures = folder.job(), folder.sealed(), folder.failures()
+    job, done, failures = folder.job(), folder.list_sealed(), folder.failures()
     todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
     progress = _progress(folder)
     stages = _stages(root, size_forecast.pilot(done))
@@ -58,46 +58,48 @@ def read_status(root: Path) -> Status:
 def lines(status: Status) -> list[str]:
     """The status as lines of text."""
     count = sum(status.failed.values())
-    found = [f"{status.done} of {status.total} sequences done, {count} failed"]
-    found += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
+    rows = [f"{status.done} of {status.total} sequences done, {count} failed"]
+    rows += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
     if count:
-        found.append("  `synth render --retry` computes the failed ones again")
+        rows.append("  `synth render --retry` computes the failed ones again")
     if status.running:
         left = "" if status.left_s is None else f", {clock(status.left_s)} left"
-        found.append(f"a run is in progress{left}")
+        rows.append(f"a run is in progress{left}")
         for key, (stage, step, of) in status.in_flight.items():
-            found.append(f"  {int(key):06d} {stage} {step} of {of}")
+            rows.append(f"  {int(key):06d} {stage} {step} of {of}")
     elif status.ahead.sequences:
-        found.append("no run is in progress; `synth render` with the same job and folder continues")
+        rows.append("no run is in progress; `synth render` with the same job and folder continues")
     if status.stages_cpu_s:
-        each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
-        found.append(f"CPU-seconds per sequence: {each}")
+        stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
+        rows.append(f"CPU-seconds per sequence: {stages}")
     if status.ahead.sequences:
         ahead = status.ahead
         basis = f"from {ahead.pilot} finished" if ahead.pilot else "estimated"
         time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
         needed, free = map(size_forecast.amount, (ahead.bytes, status.disk_free))
-        found.append(
+        rows.append(
             f"remaining: {ahead.sequences} sequences, {needed}{time} ({basis}); the disk has {free} free"
         )
-    return found
+    return rows
 
 
 def _progress(folder: Folder) -> RunProgress | None:
     """Progress of the current run, or of all runs of parts together; None if there is none."""
     files = [*folder.running(), *([folder.progress_file] if file_lock.is_held(folder.lock_file) else [])]
-    found = RunProgress()
+    progress = RunProgress()
     for file in files:
         with suppress(UserError):  # it has just begun, or is of another version
-            part = validated(RunProgress, checked_file.read_json(file), file.name)
-            left = [one for one in (found.left_s, part.left_s) if one is not None]
-            found = RunProgress(max(left, default=None), {**found.in_flight, **part.in_flight})
-    return found if files else None
+            part = validate_values(RunProgress, checked_file.read_json(file), file.name)
+            left = [seconds for seconds in (progress.left_s, part.left_s) if seconds is not None]
+            progress = RunProgress(max(left, default=None), {**progress.in_flight, **part.in_flight})
+    return progress if files else None
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
-    read = []
+    timings = []
     for key in pilot:
         with suppress(UserError):  # damage is reported by `synth verify`
-            read.append(open_sequence(location.store(root, key)).stages_cpu_s)
-    return {name: sum(one.get(name, 0.0) for one in read) / len(read) for name in ChainMap(*read)}
+            timings.append(open_sequence(location.store(root, key)).stages_cpu_s)
+    return {
+        name: sum(stages.get(name, 0.0) for stages in timings) / len(timings) for name in ChainMap(*timings)
+    }

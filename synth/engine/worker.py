@@ -40,7 +40,7 @@ def main(pipe: int) -> None:
 
 
 def _serve(pipe: int, setup: dict[str, Any], folder: Folder) -> None:
-    render, settled = None, False
+    render, frozen = None, False
     for line in sys.stdin:
         index = int(line)
         log = folder.logs / f"{index:06d}.log"
@@ -56,18 +56,22 @@ def _serve(pipe: int, setup: dict[str, Any], folder: Folder) -> None:
             _send(pipe, failed="input", reason=str(error))
         except Exception as error:  # any error fails this sequence only, not the run
             traceback.print_exc()
-            full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-            kind, first = "disk" if full else "error", (str(error).splitlines() or [""])[0]
+            disk_full = isinstance(error, OSError) and error.errno in (
+                errno.ENOSPC,
+                errno.EDQUOT,
+                errno.EROFS,
+            )
+            kind, message = "disk" if disk_full else "error", (str(error).splitlines() or [""])[0]
             if isinstance(error, MemoryError):
-                kind, first = "memory", "out of memory"
-            _send(pipe, failed=kind, reason=f"{type(error).__name__}: {first}")
+                kind, message = "memory", "out of memory"
+            _send(pipe, failed=kind, reason=f"{type(error).__name__}: {message}")
         else:
             log.unlink(missing_ok=True)
             _send(pipe, sealed=index)
         gc.collect()
-        if render is not None and not settled:
+        if render is not None and not frozen:
             gc.freeze()  # libraries hold a million permanent objects, whose scanning took 0.7 s a sequence
-            settled = True
+            frozen = True
 
 
 def _prepare(setup: dict[str, Any]) -> Callable[..., None]:

@@ -46,24 +46,25 @@ def divergence(cells: Indices, slope: Floats, weight: Floats, stress: Floats, ou
             w = weight[e, q]
             for n in range(nodes):
                 a, b, c = w * slope[e, q, n, 0], w * slope[e, q, n, 1], w * slope[e, q, n, 2]
-                at = cells[e, n]
+                node = cells[e, n]
                 for i in range(3):
-                    out[at, i] += p[i, 0] * a + p[i, 1] * b + p[i, 2] * c
+                    out[node, i] += p[i, 0] * a + p[i, 1] * b + p[i, 2] * c
 
 
-def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> sp.csr_array:
+def stiffness(mesh: Quadrature, moduli: Floats, swelling_gradient: Floats | None = None) -> sp.csr_array:
     """Tangent stiffness (3N, 3N) mN/mm of a mesh, degrees of freedom node by node.
 
-    `moduli` (M * Q, 3, 3, 3, 3) kPa: dP/dF at every point; or (1, 3, 3, 3, 3), one for all. `along` (M, n, 3)
-    sqrt(mN/mm): its outer products with itself are added to the elements' stiffness.
+    `moduli` (M * Q, 3, 3, 3, 3) kPa: dP/dF at every point; or (1, 3, 3, 3, 3), one for all.
+    `swelling_gradient` (M, n, 3) sqrt(mN/mm): its outer products with itself are added to the elements'
+    stiffness.
     """
     (elements, n), points = mesh.cells.shape, mesh.weight.shape[1]
     # By n, j -> n, (i, k, m); then, with points and m as one axis, by n, i, k -> o.
     tangent = np.moveaxis(moduli, 2, 1).reshape(-1, 1 if len(moduli) == 1 else points, 3, 27)
     half = (mesh.weight[:, :, None, None] * mesh.slope) @ tangent  # (M, Q, n, 27)
     half = half.reshape(elements, points, n * 9, 3).swapaxes(1, 2).reshape(elements, n * 9, points * 3)
-    slopes = mesh.slope.swapaxes(2, 3).reshape(elements, points * 3, n)
-    local = (half @ slopes).reshape(elements, n, 3, 3, n).swapaxes(3, 4)
-    if along is not None:
-        local += along[:, :, :, None, None] * along[:, None, None]
+    gradients = mesh.slope.swapaxes(2, 3).reshape(elements, points * 3, n)
+    local = (half @ gradients).reshape(elements, n, 3, 3, n).swapaxes(3, 4)
+    if swelling_gradient is not None:
+        local += swelling_gradient[:, :, :, None, None] * swelling_gradient[:, None, None]
     return scatter_blocks(local, mesh.cells, mesh.nodes)

@@ -22,29 +22,29 @@ _LEAF = 60  # nodes that are not divided further
 _TILE = 128
 
 
-def condense(stiffness: sp.csr_array, points: Floats, cells: Ints, kept: Ints, fixed: Mask) -> Floats:
-    """The stiffness (3 K, 3 K) mN/mm at the nodes `kept` (K,), in their order, with all others eliminated.
+def condense(stiffness: sp.csr_array, points: Floats, cells: Ints, nodes: Ints, fixed: Mask) -> Floats:
+    """The stiffness (3 K, 3 K) mN/mm at `nodes` (K,), in their order, with all others eliminated.
 
     Args:
         stiffness: (3 N, 3 N) mN/mm, symmetric, degrees of freedom node by node, between nodes of one element.
         points: (N, 3) mm; they only decide the order of elimination.
         cells: (M, n) nodes of the elements, corners first.
-        kept: indices of nodes, none of them fixed.
+        nodes: indices of the kept ones, none of them fixed.
         fixed: (N,) nodes that cannot move.
 
     Raises:
         LinAlgError: the eliminated part is not positive definite, as nothing holds it.
     """
-    inner = ~fixed
-    inner[kept] = False
+    interior = ~fixed
+    interior[nodes] = False
     centre = points[cells[:, :4]].mean(axis=1)
     mesh = _Mesh(sp.csr_array(stiffness), cells, centre, fixed, np.full(3 * len(points), -1, np.int64))
-    front = mesh.eliminate(np.arange(len(cells)), np.flatnonzero(inner))
-    whole = mesh.entries(kept, kept)
-    order = np.argsort(kept)
-    place = degrees_of_freedom(order[np.searchsorted(kept, front.nodes, sorter=order)])
-    whole[np.ix_(place, place)] += front.update
-    return whole
+    front = mesh.eliminate(np.arange(len(cells)), np.flatnonzero(interior))
+    schur = mesh.entries(nodes, nodes)
+    order = np.argsort(nodes)
+    place = degrees_of_freedom(order[np.searchsorted(nodes, front.nodes, sorter=order)])
+    schur[np.ix_(place, place)] += front.update
+    return schur
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,48 +63,50 @@ class _Mesh:
     fixed: Mask  # (N,)
     column: Ints  # (3 N,) scratch of `entries`, -1 between its calls
 
-    def eliminate(self, elements: Ints, inner: Ints) -> _Front:
-        """Eliminates the nodes `inner`, which only these elements touch: half by half, then those between."""
-        halves, between = list[_Front](), inner
-        if len(inner) > _LEAF:
-            parts, sides, between = min((self._cut(elements, inner, axis) for axis in range(3)), key=_width)
-            remaining = [np.setdiff1d(side, between) for side in sides]
-            halves = [self.eliminate(*half) for half in zip(parts, remaining, strict=True) if len(half[1])]
-        beside = self.cells[elements[np.isin(self.cells[elements], between).any(axis=1)]].ravel()
-        touched = np.unique(np.concatenate([beside, *(half.nodes for half in halves)]))
-        around = np.setdiff1d(touched[~self.fixed[touched]], inner, assume_unique=True)
-        own, side = self.entries(between, between), self.entries(around, between)
-        update = np.zeros((3 * len(around),) * 2)
-        for half in halves:
-            inside, outside = (_shared(half.nodes, nodes) for nodes in (between, around))
-            own[np.ix_(inside.place, inside.place)] += half.update[np.ix_(inside.part, inside.part)]
-            side[np.ix_(outside.place, inside.place)] += half.update[np.ix_(outside.part, inside.part)]
-            update[np.ix_(outside.place, outside.place)] += half.update[np.ix_(outside.part, outside.part)]
-        root = cholesky(own, lower=True, check_finite=False)
-        taken = solve_triangular(root, side.T, lower=True, check_finite=False)
+    def eliminate(self, elements: Ints, interior: Ints) -> _Front:
+        """Eliminates the nodes `interior`, which only these elements touch: by halves, then those between."""
+        fronts, separator = list[_Front](), interior
+        if len(interior) > _LEAF:
+            parts, sides, separator = min(
+                (self._cut(elements, interior, axis) for axis in range(3)), key=_width
+            )
+            remaining = [np.setdiff1d(side, separator) for side in sides]
+            fronts = [self.eliminate(*half) for half in zip(parts, remaining, strict=True) if len(half[1])]
+        adjacent_nodes = self.cells[elements[np.isin(self.cells[elements], separator).any(axis=1)]].ravel()
+        touched = np.unique(np.concatenate([adjacent_nodes, *(front.nodes for front in fronts)]))
+        boundary = np.setdiff1d(touched[~self.fixed[touched]], interior, assume_unique=True)
+        pivot, coupling = self.entries(separator, separator), self.entries(boundary, separator)
+        update = np.zeros((3 * len(boundary),) * 2)
+        for front in fronts:
+            inner, outer = (_intersect(front.nodes, nodes) for nodes in (separator, boundary))
+            pivot[np.ix_(inner.place, inner.place)] += front.update[np.ix_(inner.part, inner.part)]
+            coupling[np.ix_(outer.place, inner.place)] += front.update[np.ix_(outer.part, inner.part)]
+            update[np.ix_(outer.place, outer.place)] += front.update[np.ix_(outer.part, outer.part)]
+        pivot_factor = cholesky(pivot, lower=True, check_finite=False)
+        coupling_factor = solve_triangular(pivot_factor, coupling.T, lower=True, check_finite=False)
         # One triangle, in place: NumPy's product takes twice as long, to mirror entry by entry.
-        update = dsyrk(-1.0, taken, beta=1.0, c=update.T, trans=1, overwrite_c=1).T
+        update = dsyrk(-1.0, coupling_factor, beta=1.0, c=update.T, trans=1, overwrite_c=1).T
         _mirror(update)
-        return _Front(around, update)
+        return _Front(boundary, update)
 
     def entries(self, rows: Ints, columns: Ints) -> Floats:
         """The stiffness (3 R, 3 C) between nodes (R,) and (C,)."""
-        across = degrees_of_freedom(columns)
-        self.column[across] = np.arange(len(across))
+        dofs = degrees_of_freedom(columns)
+        self.column[dofs] = np.arange(len(dofs))
         part = sp.coo_array(self.stiffness[degrees_of_freedom(rows)])
         place = self.column[part.col]
-        self.column[across] = -1
-        dense, used = np.zeros((3 * len(rows), len(across))), place >= 0
-        dense[part.row[used], place[used]] = part.data[used]
+        self.column[dofs] = -1
+        dense, mask = np.zeros((3 * len(rows), len(dofs))), place >= 0
+        dense[part.row[mask], place[mask]] = part.data[mask]
         return dense
 
-    def _cut(self, elements: Ints, inner: Ints, axis: int) -> _Cut:
+    def _cut(self, elements: Ints, interior: Ints, axis: int) -> _Cut:
         """Cuts elements (M,) into halves along an axis."""
-        along = self.centre[elements, axis]
-        low = along <= np.median(along)
+        coordinate = self.centre[elements, axis]
+        low = coordinate <= np.median(coordinate)
         parts = elements[low], elements[~low]
-        below, above = (np.intersect1d(inner, self.cells[part]) for part in parts)
-        return parts, (below, above), np.intersect1d(below, above)
+        lower, upper = (np.intersect1d(interior, self.cells[part]) for part in parts)
+        return parts, (lower, upper), np.intersect1d(lower, upper)
 
 
 _Cut = tuple[tuple[Ints, Ints], tuple[Ints, Ints], Ints]
@@ -112,16 +114,16 @@ _Cut = tuple[tuple[Ints, Ints], tuple[Ints, Ints], Ints]
 
 
 @dataclass(frozen=True, eq=False)
-class _Shared:
+class _Overlap:
     """Degrees of freedom that two lists of nodes have in common, in one order."""
 
     part: Ints  # in the first
     place: Ints  # in the second
 
 
-def _shared(nodes: Ints, others: Ints) -> _Shared:
+def _intersect(nodes: Ints, others: Ints) -> _Overlap:
     _, part, place = np.intersect1d(nodes, others, assume_unique=True, return_indices=True)
-    return _Shared(degrees_of_freedom(part), degrees_of_freedom(place))
+    return _Overlap(degrees_of_freedom(part), degrees_of_freedom(place))
 
 
 def _mirror(matrix: Floats) -> None:

@@ -66,38 +66,44 @@ class Deformation:
 
 
 def check_deformation(
-    found: Deformation, surface: Shape, frames: int, instruments: int, labelled: bool = True
+    result: Deformation, surface: Shape, frames: int, instruments: int, labelled: bool = True
 ) -> None:
     """Raises UserError unless a result is one of that surface, over those frames, with those instruments.
 
     Arrays must have the type and shape of `Deformation` and finite values; frame 0 is at rest; traction times
     area adds up to the force. Without a label (`labelled`) loads may be NaN.
     """
-    if not isinstance(found, Deformation):
-        raise UserError(f"mechanics: expected a Deformation, got {type(found).__name__}")
-    whole = (frames, len(surface.vertices), 3)
-    ends = (frames, 2 * instruments, 3)
-    shapes = {"displacement": whole, "traction": whole, "force": (frames, 3), "tip": ends, "shaft": ends}
+    if not isinstance(result, Deformation):
+        raise UserError(f"mechanics: expected a Deformation, got {type(result).__name__}")
+    vertex_shape = (frames, len(surface.vertices), 3)
+    tip_shape = (frames, 2 * instruments, 3)
+    shapes = {
+        "displacement": vertex_shape,
+        "traction": vertex_shape,
+        "force": (frames, 3),
+        "tip": tip_shape,
+        "shaft": tip_shape,
+    }
     shapes |= {"by_instrument": (frames, instruments, 3), **dict.fromkeys(_OPTIONAL, (frames,))}
     for name, shape in shapes.items():
-        value = getattr(found, name)
+        value = getattr(result, name)
         if value is None and name in _OPTIONAL:
             continue
         if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.shape != shape:
-            given = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
-            raise UserError(f"mechanics: {name} must be float64 {shape}, not {given}")
+            actual = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
+            raise UserError(f"mechanics: {name} must be float64 {shape}, not {actual}")
         if not np.isfinite(value).all() and (labelled or name not in _LOADS):
             raise UserError(f"mechanics: {name} has values that are not finite")
     for name in ("displacement", "traction", "force", "by_instrument"):
-        size = np.abs(getattr(found, name))
+        size = np.abs(getattr(result, name))
         if size[0].max(initial=0.0) > _ROUNDING * size.max(initial=0.0):
             raise UserError(f"mechanics: {name} is not 0 in frame 0, the rest frame")
-    if np.abs(np.linalg.norm(found.shaft, axis=2) - 1).max(initial=0.0) > _ROUNDING:
+    if np.abs(np.linalg.norm(result.shaft, axis=2) - 1).max(initial=0.0) > _ROUNDING:
         raise UserError("mechanics: shaft must be unit vectors")
     area = vertex_area(*surface)
-    total, size = (np.einsum("v,tvd->td", area, t) for t in (found.traction, np.abs(found.traction)))
-    off = np.abs(total - found.force).max(axis=1)
-    if off.max() > _ROUNDING * max(size.max(), np.abs(found.force).max()):
-        t = int(off.argmax())
-        sums = f"{np.round(total[t], 4).tolist()} mN, force is {np.round(found.force[t], 4).tolist()} mN"
+    total, size = (np.einsum("v,tvd->td", area, t) for t in (result.traction, np.abs(result.traction)))
+    imbalance = np.abs(total - result.force).max(axis=1)
+    if imbalance.max() > _ROUNDING * max(size.max(), np.abs(result.force).max()):
+        t = int(imbalance.argmax())
+        sums = f"{np.round(total[t], 4).tolist()} mN, force is {np.round(result.force[t], 4).tolist()} mN"
         raise UserError(f"mechanics: traction times area in frame {t} is {sums}")

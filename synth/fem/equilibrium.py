@@ -58,17 +58,17 @@ def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPat
     """
     linear = _LinearResponse(system)
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    largest = float(np.sqrt(np.vdot(peak, peak))) or 1.0
+    peak_norm = float(np.sqrt(np.vdot(peak, peak))) or 1.0
     scale = float(np.sqrt(np.vdot(peak, linear(peak)))) or 1.0
     extrapolation = _NonlinearExtrapolation(linear)
 
-    def step(load: Floats, last: Floats) -> tuple[Floats, State, float]:
+    def step(load: Floats, previous: Floats) -> tuple[Floats, State, float]:
         if system.law == "linear":
             u = linear(load)
             state = system.state(u)
-            return u, state, float(np.linalg.norm(on_free(system, load - state.force)) / largest)
+            return u, state, float(np.linalg.norm(mask_fixed(system, load - state.force)) / peak_norm)
         start = extrapolation.predict(load)
-        u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last)
+        u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, previous)
         extrapolation.add(load, u)
         return u, state, norm / scale
 
@@ -89,13 +89,13 @@ def follow_loads(
         frame = -(-number // substeps)
         parameter = float(load_parameter[frame])
         u, state, residual = step(load, u)
-        least = check_state(system, u, state, frame, parameter)
+        min_jacobian = check_state(system, u, state, frame, parameter)
         if residual > tolerance:
-            stalled = f"no equilibrium at load {parameter:.3g} (out of balance by {residual:.1e})"
-            raise NoEquilibrium(f"frame {frame}: {stalled}; lower the load")
-        path.append((u, least, state.energy, residual))
-    displacement, least_jacobian, energy, residuals = zip(*path[::substeps], strict=True)
-    return LoadPath(np.stack(displacement), np.array(least_jacobian), np.array(energy), np.array(residuals))
+            fault = f"no equilibrium at load {parameter:.3g} (out of balance by {residual:.1e})"
+            raise NoEquilibrium(f"frame {frame}: {fault}; lower the load")
+        path.append((u, min_jacobian, state.energy, residual))
+    displacement, jacobians, energy, residuals = zip(*path[::substeps], strict=True)
+    return LoadPath(np.stack(displacement), np.array(jacobians), np.array(energy), np.array(residuals))
 
 
 class _LinearResponse:
@@ -115,14 +115,14 @@ class _LinearResponse:
             share = float(np.vdot(direction, remainder))
             u = u + share * response
             remainder = remainder - share * direction
-        left = float(np.linalg.norm(remainder))
-        if left <= 1e-10 * size:
+        remainder_norm = float(np.linalg.norm(remainder))
+        if remainder_norm <= 1e-10 * size:
             return u
-        direction = remainder / left
+        direction = remainder / remainder_norm
         response = self._system.solve(direction)
         self._directions.append(direction)
         self._responses.append(response)
-        return u + left * response
+        return u + remainder_norm * response
 
 
 class _NonlinearExtrapolation:
@@ -130,28 +130,30 @@ class _NonlinearExtrapolation:
     a polynomial of second and third degree in the loads' components, by least squares."""
 
     def __init__(self, linear: _LinearResponse) -> None:
-        self._linear, self._shares, self._added = linear, list[Floats](), list[Floats]()
+        self._linear, self._shares, self._deviations = linear, list[Floats](), list[Floats]()
 
     def add(self, load: Floats, u: Floats) -> None:
         """Stores the state u (N, 3) mm under a load (N, 3) mN."""
-        self._added.append(u - self._linear(load))
+        self._deviations.append(u - self._linear(load))
         self._shares.append(self._linear.shares(load))
 
     def predict(self, load: Floats) -> Floats:
         u = self._linear(load)
         shares = self._linear.shares(load)
-        known = np.zeros((len(self._shares) + 1, len(shares)))
-        for row, one in zip(known, [*self._shares, shares], strict=True):
-            row[: len(one)] = one
-        known = known[:, np.abs(known[:-1]).max(axis=0, initial=0) > 0]
-        if not 0 < known.shape[1] <= _DIRECTIONS:
-            return u + (self._added[-1] if self._added else 0.0)
-        known /= np.abs(known).max(axis=0)
-        of = range(known.shape[1])
-        factors = [*combinations_with_replacement(of, 2), *combinations_with_replacement(of, 3)]
-        terms = np.stack([known[:, list(which)].prod(axis=1) for which in factors], axis=1)
-        for part, added in zip(terms[-1] @ np.linalg.pinv(terms[:-1], 1e-6), self._added, strict=True):
-            u = u + part * added
+        components = np.zeros((len(self._shares) + 1, len(shares)))
+        for row, row_shares in zip(components, [*self._shares, shares], strict=True):
+            row[: len(row_shares)] = row_shares
+        components = components[:, np.abs(components[:-1]).max(axis=0, initial=0) > 0]
+        if not 0 < components.shape[1] <= _DIRECTIONS:
+            return u + (self._deviations[-1] if self._deviations else 0.0)
+        components /= np.abs(components).max(axis=0)
+        axes = range(components.shape[1])
+        factor_sets = [*combinations_with_replacement(axes, 2), *combinations_with_replacement(axes, 3)]
+        terms = np.stack([components[:, list(factors)].prod(axis=1) for factors in factor_sets], axis=1)
+        for weight, deviation in zip(
+            terms[-1] @ np.linalg.pinv(terms[:-1], 1e-6), self._deviations, strict=True
+        ):
+            u = u + weight * deviation
         return u
 
 
@@ -159,30 +161,35 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
     """Smallest det F of displacements u (N, 3) mm. Raises NotFinite or InvertedElement."""
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
-    least, element = system.least_jacobian(u)
-    if least <= LEAST_JACOBIAN:
-        turned = f"load {load:.3g} turns element {element} inside out or nearly so"
-        needed = f"(det F {least:.2f}, more than {LEAST_JACOBIAN:g} is needed)"
-        raise InvertedElement(f"frame {frame}: {turned} {needed}; lower the load")
-    return least
+    min_jacobian, element = system.least_jacobian(u)
+    if min_jacobian <= LEAST_JACOBIAN:
+        fault = f"load {load:.3g} turns element {element} inside out or nearly so"
+        limit = f"(det F {min_jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed)"
+        raise InvertedElement(f"frame {frame}: {fault} {limit}; lower the load")
+    return min_jacobian
 
 
 def minimise_energy(
-    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, iterations: int = _ITERATIONS
+    system: System,
+    load: Floats,
+    start: Floats,
+    tolerance: float,
+    fallback: Floats,
+    iterations: int = _ITERATIONS,
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
     Nocedal & Wright, Numerical Optimization, 7.4; Liu, Bouaziz & Kavan, "Quasi-Newton methods for real-time
     simulation of hyperelastic materials" (ACM Trans. Graph. 36, 2017).
 
-    `load`: (N, 3) mN; `start`, `safe`: (N, 3) mm, and one of finite energy, used where `start` has none;
+    `load`: (N, 3) mN; `start`, `fallback`: (N, 3) mm, and one of finite energy, used where `start` has none;
     `tolerance`: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm); `iterations`: at most. Returns
     displacement, its state and the residual's norm, which may exceed the tolerance.
     """
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
-        u, state = safe, system.state(safe)
-    gradient = on_free(system, state.force - load)
+        u, state = fallback, system.state(fallback)
+    gradient = mask_fixed(system, state.force - load)
     history: list[_Step] = []
     norm = np.inf
     preconditioned = system.solve(gradient)
@@ -206,12 +213,12 @@ def minimise_energy(
             length *= 0.5
         else:
             break
-        trial_gradient = on_free(system, trial_state.force - load)
+        trial_gradient = mask_fixed(system, trial_state.force - load)
         s, y = length * direction, trial_gradient - gradient
         curvature = float(np.vdot(s, y))
-        then, preconditioned = preconditioned, system.solve(trial_gradient)
+        previous, preconditioned = preconditioned, system.solve(trial_gradient)
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            history.append((s, y, curvature, preconditioned - then))
+            history.append((s, y, curvature, preconditioned - previous))
             del history[:-_HISTORY]
         u, state, gradient = trial, trial_state, trial_gradient
     return u, state, norm
@@ -221,17 +228,17 @@ def _two_loop_recursion(gradient: Floats, preconditioned: Floats, history: list[
     """The inverse Hessian times the gradient (Nocedal & Wright, algorithm 7.4), with the rest stiffness as
     its seed; `preconditioned` (N, 3) mm is the inverse rest stiffness times the gradient (N, 3) mN."""
     q, r, alphas = gradient.copy(), preconditioned.copy(), []
-    for s, y, curvature, solved in reversed(history):
+    for s, y, curvature, preconditioned_y in reversed(history):
         alpha = float(np.vdot(s, q)) / curvature
         q -= alpha * y
-        r -= alpha * solved
+        r -= alpha * preconditioned_y
         alphas.append(alpha)
     for (s, y, curvature, _), alpha in zip(history, reversed(alphas), strict=True):
         r += s * (alpha - float(np.vdot(y, r)) / curvature)
     return r
 
 
-def on_free(system: System, force: Floats) -> Floats:
+def mask_fixed(system: System, force: Floats) -> Floats:
     """The force (N, 3) mN at free degrees of freedom, 0 at fixed ones."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]

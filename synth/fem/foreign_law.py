@@ -21,11 +21,11 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
     """
     law, label = load_checked(name)
     with np.errstate(all="ignore"), as_user_error(label):  # undefined values are handled below
-        found, first = map(np.asarray, law.stress(strain + np.eye(3), mu, lam))
-    if found.shape != energy.shape or first.shape != out.shape:
-        raise UserError(f"{label}: stress gives {found.shape}, {first.shape}, not {out.shape}")
-    energy[:] = np.where(np.isfinite(found), found, np.inf)
-    out[:] = np.where(np.isfinite(first), first, 0.0)
+        density, piola = map(np.asarray, law.stress(strain + np.eye(3), mu, lam))
+    if density.shape != energy.shape or piola.shape != out.shape:
+        raise UserError(f"{label}: stress gives {density.shape}, {piola.shape}, not {out.shape}")
+    energy[:] = np.where(np.isfinite(density), density, np.inf)
+    out[:] = np.where(np.isfinite(piola), piola, 0.0)
 
 
 @cache
@@ -42,25 +42,31 @@ def check_law(law: Law) -> None:
     mu, lam = lame(1.0, 0.4)
     rng = np.random.default_rng(0)
     f = np.eye(3) + 0.15 * rng.uniform(-1, 1, (8, 3, 3))
-    energy, first = (np.asarray(one, np.float64) for one in law.stress(f, mu, lam))
-    if energy.shape != (8,) or first.shape != (8, 3, 3):
-        raise UserError(f"stress must give (n,) and (n, 3, 3), not {energy.shape}, {first.shape}")
-    way = rng.normal(size=(8, 3, 3))
-    up, down = (law.stress(f + sign * _STEP * way, mu, lam)[0] for sign in (1, -1))
-    _agree((up - down) / (2 * _STEP), np.einsum("nij,nij->n", first, way), "is not its energy's derivative")
-    still = np.eye(3)[None]
-    _agree(law.stress(still, mu, lam)[1], np.zeros((1, 3, 3)), "is not zero at rest")
-    small = 1e-6 * (way + way.transpose(0, 2, 1))
-    hooke = 2 * mu * small + lam * np.trace(small, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    _agree(law.stress(np.eye(3) + small, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's law near rest")
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    turn *= np.sign(np.linalg.det(turn))
-    _agree(law.stress(turn @ f, mu, lam)[0], energy, "changes under a rotation of the whole")
-    more = law.stress(f, mu, lam + 1.0)[0] - energy
-    _agree(more, 0.5 * np.log(np.linalg.det(f)) ** 2, "does not depend on lambda as lambda/2 (log J)^2 does")
+    energy, piola = (np.asarray(values, np.float64) for values in law.stress(f, mu, lam))
+    if energy.shape != (8,) or piola.shape != (8, 3, 3):
+        raise UserError(f"stress must give (n,) and (n, 3, 3), not {energy.shape}, {piola.shape}")
+    direction = rng.normal(size=(8, 3, 3))
+    up, down = (law.stress(f + sign * _STEP * direction, mu, lam)[0] for sign in (1, -1))
+    _require_close(
+        (up - down) / (2 * _STEP), np.einsum("nij,nij->n", piola, direction), "is not its energy's derivative"
+    )
+    identity = np.eye(3)[None]
+    _require_close(law.stress(identity, mu, lam)[1], np.zeros((1, 3, 3)), "is not zero at rest")
+    strain = 1e-6 * (direction + direction.transpose(0, 2, 1))
+    hooke = 2 * mu * strain + lam * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    _require_close(
+        law.stress(np.eye(3) + strain, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's law near rest"
+    )
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    _require_close(law.stress(rotation @ f, mu, lam)[0], energy, "changes under a rotation of the whole")
+    change = law.stress(f, mu, lam + 1.0)[0] - energy
+    _require_close(
+        change, 0.5 * np.log(np.linalg.det(f)) ** 2, "does not depend on lambda as lambda/2 (log J)^2 does"
+    )
 
 
-def _agree(found: Floats, expected: Floats, fault: str) -> None:
+def _require_close(actual: Floats, expected: Floats, fault: str) -> None:
     size = float(np.abs(expected).max()) or 1.0
-    if not np.abs(found - expected).max() <= _CLOSE * size:  # NaN fails as well
+    if not np.abs(actual - expected).max() <= _CLOSE * size:  # NaN fails as well
         raise UserError(f"its stress {fault}")

@@ -54,13 +54,13 @@ def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: F
     f, slope = np.empty((3, 3)), np.empty((points, 3, 3))
     energy = 0.0
     for e in range(elements):
-        whole, volume = 0.0, 0.0
+        total, volume = 0.0, 0.0
         for q in range(points):
             _deformation(strain[e * points + q], f)
             swelling = _swelling(law, f, slope[q])
-            whole += weight[e, q] * swelling
+            total += weight[e, q] * swelling
             volume += weight[e, q]
-        mean = whole / volume
+        mean = total / volume
         energy += 0.5 * lam * volume * mean * mean
         for q in range(points):
             for i in range(3):
@@ -103,8 +103,8 @@ def least_determinant(strain: Floats) -> tuple[float, int]:
     a, b, c = np.moveaxis(strain + np.eye(3), 0, -1)
     det = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0])
     det += a[2] * (b[0] * c[1] - b[1] * c[0])
-    where = int(np.nanargmin(det)) if not np.isnan(det).all() else 0
-    return float(det[where]), where
+    index = int(np.nanargmin(det)) if not np.isnan(det).all() else 0
+    return float(det[index]), index
 
 
 @inlined

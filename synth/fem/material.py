@@ -42,5 +42,5 @@ class Tissue:
         if pia is not None:
             stiffness = pia.young_kpa * pia.thickness_mm / self.young_kpa
             sheet = MembraneSheet(stiffness, pia.stretch, pia.stiffening)
-        given = self.law, self.poisson, sheet, self.alpha
-        return _SYSTEMS.get(lambda: assemble(tets, *given), tets, given)
+        parameters = self.law, self.poisson, sheet, self.alpha
+        return _SYSTEMS.get(lambda: assemble(tets, *parameters), tets, parameters)

@@ -78,27 +78,31 @@ class Membrane:
         """(3N, 3N) mN/mm at (N, 3) mm, positive semi-definite: exact but where it begins to wrinkle."""
         return self._stiffness(self.tangent + np.einsum("fqna,fni->fqia", self.slope, u[self.faces]))
 
-    def _stiffness(self, place: Floats) -> sp.csr_array:
+    def _stiffness(self, basis: Floats) -> sp.csr_array:
         """At tangents (F, Q, 3, 2) that the sheet has moved."""
-        metric = self.square * np.einsum("fqia,fqib->fqab", place, place)
+        metric = self.square * np.einsum("fqia,fqib->fqab", basis, basis)
         if self.linear:
-            stress, moduli = _taut(metric)
+            stress, moduli = _evaluate_taut(metric)
         else:
-            stress, moduli = _relaxed(metric, self.stiffening)
+            stress, moduli = _evaluate_wrinkling(metric, self.stiffening)
         stress, moduli = self.stiffness * self.square * stress, self.stiffness * self.square**2 * moduli
-        bent = np.einsum("fqna,fqib->fqniab", self.slope, place)
-        local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
-        held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
-        local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
+        metric_slope = np.einsum("fqna,fqib->fqniab", self.slope, basis)
+        local = np.einsum(
+            "fqniab,fqabcd,fqmjcd,fq->fnimj", metric_slope, moduli, metric_slope, self.weight, optimize=True
+        )
+        geometric = np.einsum(
+            "fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True
+        )
+        local += np.einsum("fnm,ij->fnimj", geometric, np.eye(3))
         return scatter_blocks(local, self.faces, len(self.balance))
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     """A membrane over a volume's surface but its cut walls; `linear`: small strain, without pre-stretch."""
-    found = lay(tets, sheet, linear=linear)
+    membrane = lay(tets, sheet, linear=linear)
     balance = np.zeros_like(tets.points)
-    stored = found.pull(balance.copy(), balance)
-    return replace(found, balance=balance, stored=stored)
+    energy = membrane.pull(balance.copy(), balance)
+    return replace(membrane, balance=balance, stored=energy)
 
 
 def lay(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
@@ -142,35 +146,35 @@ def _pull(
     """Adds the forces of the whole sheet, stretch at rest included, and returns its energy."""
     count, points, nodes, _ = slope.shape
     energy = 0.0
-    moved, bent = np.empty((3, 2)), np.empty((3, 2))
+    gradient, basis = np.empty((3, 2)), np.empty((3, 2))
     for f in range(count):
         for q in range(points):
             for i in range(3):
-                moved[i, 0] = moved[i, 1] = 0.0
+                gradient[i, 0] = gradient[i, 1] = 0.0
             for n in range(nodes):
                 a, b = slope[f, q, n, 0], slope[f, q, n, 1]
                 for i in range(3):
                     v = u[faces[f, n], i]
-                    moved[i, 0] += v * a
-                    moved[i, 1] += v * b
+                    gradient[i, 0] += v * a
+                    gradient[i, 1] += v * b
             if linear:
                 xx, yy, xy = 0.0, 0.0, 0.0
                 for i in range(3):
-                    bent[i, 0], bent[i, 1] = tangent[f, q, i, 0], tangent[f, q, i, 1]
-                    xx += bent[i, 0] * moved[i, 0]
-                    yy += bent[i, 1] * moved[i, 1]
-                    xy += 0.5 * (bent[i, 0] * moved[i, 1] + bent[i, 1] * moved[i, 0])
+                    basis[i, 0], basis[i, 1] = tangent[f, q, i, 0], tangent[f, q, i, 1]
+                    xx += basis[i, 0] * gradient[i, 0]
+                    yy += basis[i, 1] * gradient[i, 1]
+                    xy += 0.5 * (basis[i, 0] * gradient[i, 1] + basis[i, 1] * gradient[i, 0])
                 trace = xx + yy
                 density = (xx * xx + yy * yy + 2 * xy * xy + trace * trace) / 3
                 sxx, syy, sxy = 2 / 3 * (xx + trace), 2 / 3 * (yy + trace), 2 / 3 * xy
             else:
                 xx, yy, xy = 0.0, 0.0, 0.0
                 for i in range(3):
-                    bent[i, 0] = tangent[f, q, i, 0] + moved[i, 0]
-                    bent[i, 1] = tangent[f, q, i, 1] + moved[i, 1]
-                    xx += bent[i, 0] * bent[i, 0]
-                    yy += bent[i, 1] * bent[i, 1]
-                    xy += bent[i, 0] * bent[i, 1]
+                    basis[i, 0] = tangent[f, q, i, 0] + gradient[i, 0]
+                    basis[i, 1] = tangent[f, q, i, 1] + gradient[i, 1]
+                    xx += basis[i, 0] * basis[i, 0]
+                    yy += basis[i, 1] * basis[i, 1]
+                    xy += basis[i, 0] * basis[i, 1]
                 density, sxx, syy, sxy = _stretch(square * xx, square * yy, square * xy)
                 growth = square
                 if stiffening > 0:
@@ -183,7 +187,7 @@ def _pull(
                 a, b = slope[f, q, n, 0], slope[f, q, n, 1]
                 along, aside = w * (sxx * a + sxy * b), w * (sxy * a + syy * b)
                 for i in range(3):
-                    out[faces[f, n], i] += bent[i, 0] * along + bent[i, 1] * aside
+                    out[faces[f, n], i] += basis[i, 0] * along + basis[i, 1] * aside
     return energy
 
 
@@ -205,37 +209,37 @@ def _stretch(xx: float, yy: float, xy: float) -> tuple[float, float, float, floa
     return energy, (1 - yy * over) / 3, (1 - xx * over) / 3, xy * over / 3
 
 
-def _taut(metric: Floats) -> tuple[Floats, Floats]:
+def _evaluate_taut(metric: Floats) -> tuple[Floats, Floats]:
     """Second Piola-Kirchhoff stress (..., 2, 2) and its derivative by strain at the metric C, for S = 1, of a
     neo-Hookean sheet without wrinkles."""
     inverse, det = np.linalg.inv(metric), np.linalg.det(metric)[..., None, None]
     stress = (np.eye(2) - inverse / det) / 3
-    crossed = np.einsum("...ac,...bd->...abcd", inverse, inverse)
-    crossed = 0.5 * (crossed + np.swapaxes(crossed, -1, -2))
-    whole = np.einsum("...ab,...cd->...abcd", inverse, inverse) + crossed
-    return stress, 2 / 3 * whole / det[..., None, None]
+    crossing = np.einsum("...ac,...bd->...abcd", inverse, inverse)
+    crossing = 0.5 * (crossing + np.swapaxes(crossing, -1, -2))
+    product = np.einsum("...ab,...cd->...abcd", inverse, inverse) + crossing
+    return stress, 2 / 3 * product / det[..., None, None]
 
 
-def _relaxed(metric: Floats, stiffening: float) -> tuple[Floats, Floats]:
-    """As `_taut`, of a sheet that stiffens and wrinkles."""
-    size, way = np.linalg.eigh(metric)
-    small, large = size[..., 0], np.maximum(size[..., 1], 1.0)  # below 1 it is slack: 0, as at 1
-    stress, moduli = _taut(metric)
-    excess = np.trace(metric, axis1=-2, axis2=-1) + 1 / (small * size[..., 1]) - 3
-    along, across = way[..., 1], way[..., 0]
-    line = along[..., :, None] * along[..., None, :]
-    turn = along[..., :, None] * across[..., None, :]
-    turn = turn + np.swapaxes(turn, -1, -2)
+def _evaluate_wrinkling(metric: Floats, stiffening: float) -> tuple[Floats, Floats]:
+    """As `_evaluate_taut`, of a sheet that stiffens and wrinkles."""
+    squares, eigenvectors = np.linalg.eigh(metric)
+    small, large = squares[..., 0], np.maximum(squares[..., 1], 1.0)  # below 1 it is slack: 0, as at 1
+    stress, moduli = _evaluate_taut(metric)
+    excess = np.trace(metric, axis1=-2, axis2=-1) + 1 / (small * squares[..., 1]) - 3
+    major, minor = eigenvectors[..., 1], eigenvectors[..., 0]
+    line = major[..., :, None] * major[..., None, :]
+    shear = major[..., :, None] * minor[..., None, :]
+    shear = shear + np.swapaxes(shear, -1, -2)
     pull = (1 - large**-1.5) / 3  # of a strip
-    curve = np.where(size[..., 1] > 1, large**-2.5, 0.0)
-    gap = np.maximum(size[..., 1] - small, 1e-12)  # where it wrinkles, the stretches differ
-    folded = curve[..., None, None, None, None] * np.einsum("...ab,...cd->...abcd", line, line)
-    folded = folded + (pull / gap)[..., None, None, None, None] * np.einsum(
-        "...ab,...cd->...abcd", turn, turn
+    curve = np.where(squares[..., 1] > 1, large**-2.5, 0.0)
+    gap = np.maximum(squares[..., 1] - small, 1e-12)  # where it wrinkles, the stretches differ
+    wrinkled_moduli = curve[..., None, None, None, None] * np.einsum("...ab,...cd->...abcd", line, line)
+    wrinkled_moduli = wrinkled_moduli + (pull / gap)[..., None, None, None, None] * np.einsum(
+        "...ab,...cd->...abcd", shear, shear
     )
-    wrinkled = small * size[..., 1] < np.sqrt(large)
+    wrinkled = small * squares[..., 1] < np.sqrt(large)
     stress = np.where(wrinkled[..., None, None], pull[..., None, None] * line, stress)
-    moduli = np.where(wrinkled[..., None, None, None, None], folded, moduli)
+    moduli = np.where(wrinkled[..., None, None, None, None], wrinkled_moduli, moduli)
     if stiffening > 0:
         excess = np.where(wrinkled, large + 2 / np.sqrt(large) - 3, excess)
         power = np.exp(np.minimum(stiffening * excess, _LARGEST_POWER))[..., None, None]

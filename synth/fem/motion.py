@@ -84,17 +84,17 @@ class PronyHistory:
     def add_to(self, load: Floats) -> Floats:
         """A step's load (N, 3) mN plus the forces of the history."""
         if self._elastic is not None:
-            for (part, decay, mean), past in zip(self._terms, self._history, strict=True):
-                load = load - decay * past + part * mean * self._elastic
+            for (part, decay, mean), force in zip(self._terms, self._history, strict=True):
+                load = load - decay * force + part * mean * self._elastic
         return load
 
-    def update(self, now: Floats) -> None:
+    def update(self, force: Floats) -> None:
         """Advances the history by the elastic forces (N, 3) mN at a step's end."""
         if self._elastic is None:
-            self._elastic, self._history = np.zeros_like(now), [np.zeros_like(now) for _ in self._terms]
+            self._elastic, self._history = np.zeros_like(force), [np.zeros_like(force) for _ in self._terms]
         for k, (part, decay, mean) in enumerate(self._terms):
-            self._history[k] = decay * self._history[k] + part * mean * (now - self._elastic)
-        self._elastic = now
+            self._history[k] = decay * self._history[k] + part * mean * (force - self._elastic)
+        self._elastic = force
 
 
 def march_in_time(
@@ -102,27 +102,27 @@ def march_in_time(
 ) -> LoadPath:
     """Motion from rest under loads at equal time steps, interpolated linearly between them; otherwise as
     `equilibrium.solve_path`. `tissue`: its stiffness to a sudden load; a membrane relaxes as it does."""
-    firm, spring, substeps = clock.relative_stiffness, clock.inertia_spring, clock.substeps
+    stiffness, spring, substeps = clock.relative_stiffness, clock.inertia_spring, clock.substeps
     mass = nodal_mass(tets, clock.mass_kg) / tissue.young_kpa
-    springs = (tets.hold + sp.diags_array(spring * mass)) / firm
-    slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
+    springs = (tets.hold + sp.diags_array(spring * mass)) / stiffness
+    slip = None if tets.slip is None else sp.csr_array(tets.slip / stiffness)
     system = tissue.equations(replace(tets, hold=sp.csr_array(springs), slip=slip))
     elastic = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
     skull = replace(system, hold=tets.hold, slip=tets.slip)
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm or 1.0
-    past, before = PronyHistory(clock), np.zeros_like(peak)
+    size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / stiffness or 1.0
+    history, before = PronyHistory(clock), np.zeros_like(peak)
 
     def step(load: Floats, u: Floats) -> tuple[Floats, State, float]:
         nonlocal before
-        load = past.add_to(load)
+        load = history.add_to(load)
         if spring:
             load = load + spring * mass[:, None] * clock.inertia_target(u, before)
-        new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
-        past.update(elastic.state(new).force)
+        next_u, state, norm = minimise_energy(system, load / stiffness, u + (u - before), TOLERANCE * size, u)
+        history.update(elastic.state(next_u).force)
         before = u
-        return new, state, norm / size
+        return next_u, state, norm / size
 
     steps = [loads[0]]
     for begin, end in pairwise(loads):

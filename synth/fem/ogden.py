@@ -123,41 +123,43 @@ def tangent(
     so that a stiffness assembled of it is positive semi-definite.
     """
     u, stretch, w = np.linalg.svd(strain + np.eye(3))
-    turned = np.linalg.det(u) < 0  # det U = det V as J > 0
-    u[turned, :, 2] *= -1
-    w[turned, 2] *= -1
+    reflected = np.linalg.det(u) < 0  # det U = det V as J > 0
+    u[reflected, :, 2] *= -1
+    w[reflected, 2] *= -1
     log = np.log(stretch)
     swelling = log.sum(axis=1, keepdims=True)
     power, bulk = np.exp(alpha * (log - swelling / 3)), lam + 2 * mu / 3
     mean = power.mean(axis=1, keepdims=True)
-    added = np.broadcast_to(np.asarray(pressure, np.float64), len(strain))[:, None]
-    kirchhoff = 2 * mu / alpha * (power - mean) + bulk * swelling + added
-    first = kirchhoff / stretch
-    one = np.eye(3)
-    curve = 2 * mu * (one * power[:, None] - (power[:, :, None] + power[:, None]) / 3 + mean[:, :, None] / 3)
-    curve = (curve + bulk - one * kirchhoff[:, None]) / (stretch[:, :, None] * stretch[:, None])
+    pressures = np.broadcast_to(np.asarray(pressure, np.float64), len(strain))[:, None]
+    kirchhoff = 2 * mu / alpha * (power - mean) + bulk * swelling + pressures
+    piola = kirchhoff / stretch
+    eye = np.eye(3)
+    hessian = (
+        2 * mu * (eye * power[:, None] - (power[:, :, None] + power[:, None]) / 3 + mean[:, :, None] / 3)
+    )
+    hessian = (hessian + bulk - eye * kirchhoff[:, None]) / (stretch[:, :, None] * stretch[:, None])
     if positive:
-        size, way = np.linalg.eigh(curve)
-        straight = (way * np.maximum(size, 0)[:, None]) @ way.swapaxes(1, 2)
+        eigenvalues, eigenvectors = np.linalg.eigh(hessian)
+        stretch_block = (eigenvectors * np.maximum(eigenvalues, 0)[:, None]) @ eigenvectors.swapaxes(1, 2)
     else:
-        straight = curve
+        stretch_block = hessian
     local = np.zeros((len(strain), 3, 3, 3, 3))
     for i in range(3):
         for j in range(3):
-            local[:, i, i, j, j] += straight[:, i, j]
+            local[:, i, i, j, j] += stretch_block[:, i, j]
     for i, j in _PAIRS:
-        gap, along = stretch[:, i] - stretch[:, j], stretch[:, i] + stretch[:, j]
-        same = np.abs(gap) < _EQUAL * along
+        gap, stretch_sum = stretch[:, i] - stretch[:, j], stretch[:, i] + stretch[:, j]
+        same = np.abs(gap) < _EQUAL * stretch_sum
         flip = np.where(
-            same, curve[:, i, i] - curve[:, i, j], (first[:, i] - first[:, j]) / np.where(same, 1.0, gap)
+            same, hessian[:, i, i] - hessian[:, i, j], (piola[:, i] - piola[:, j]) / np.where(same, 1.0, gap)
         )
-        twist = (first[:, i] + first[:, j]) / along
+        twist = (piola[:, i] + piola[:, j]) / stretch_sum
         if positive:
             flip, twist = np.maximum(flip, 0), np.maximum(twist, 0)
-        equal, crossed = 0.5 * (flip + twist), 0.5 * (flip - twist)
-        local[:, i, j, i, j] += equal
-        local[:, j, i, j, i] += equal
-        local[:, i, j, j, i] += crossed
-        local[:, j, i, i, j] += crossed
+        diagonal, off_diagonal = 0.5 * (flip + twist), 0.5 * (flip - twist)
+        local[:, i, j, i, j] += diagonal
+        local[:, j, i, j, i] += diagonal
+        local[:, i, j, j, i] += off_diagonal
+        local[:, j, i, i, j] += off_diagonal
     half = np.einsum("nia,nabcd,nbj->nijcd", u, local, w, optimize=True)
     return np.asarray(np.einsum("nijcd,nkc,ndm->nijkm", half, u, w, optimize=True))

@@ -44,8 +44,8 @@ class Pulse:
             for rad, hz in ((self.heart_rad, self.heart_hz), (self.breath_rad, self.breath_hz))
         )
         wave = (np.sin(heart) + _SECOND * np.sin(2 * heart)) / _PEAK_TO_PEAK
-        above = self.heart_mm * wave + 0.5 * self.breath_mm * np.sin(breath)
-        return np.asarray(above[1:] - above[0])
+        rise = self.heart_mm * wave + 0.5 * self.breath_mm * np.sin(breath)
+        return np.asarray(rise[1:] - rise[0])
 
 
 def lift(system: System, embedding: Embedding, surface: Shape, opening_mm: float) -> Floats:
@@ -60,7 +60,7 @@ def lift(system: System, embedding: Embedding, surface: Shape, opening_mm: float
     outward = np.zeros_like(vertices)
     np.add.at(outward, faces.ravel(), np.repeat(normal, 3, axis=0))
     reach = np.hypot(vertices[:, 0], vertices[:, 1])
-    bare = np.clip(1 - (reach - opening_mm) / RIM_MM, 0, 1)
-    load = embedding.gather((bare * bare * (3 - 2 * bare))[:, None] * outward)
+    exposure = np.clip(1 - (reach - opening_mm) / RIM_MM, 0, 1)
+    load = embedding.gather((exposure * exposure * (3 - 2 * exposure))[:, None] * outward)
     middle = reach <= max(_MIDDLE * opening_mm, float(reach.min()))
     return np.asarray(load / embedding.move(system.solve(load))[middle, 2].mean())

@@ -64,28 +64,30 @@ def deform(
     area = surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
     if any(gesture.drive for gesture in gestures):
-        with _naming(gestures, tissue.young_kpa):
-            lifted = None if pulse is None else (pulse, opening_mm)
-            return _driven(scheme, tissue, tools, tets, embedding, surface, frames, fps, lifted, inside)
+        with _explain_error(gestures, tissue.young_kpa):
+            pulse_opening = None if pulse is None else (pulse, opening_mm)
+            return _deform_driven(
+                scheme, tissue, tools, tets, embedding, surface, frames, fps, pulse_opening, inside
+            )
     traction, load_parameter = _load(tools, tissue.law, surface.vertices, area, frames)
     # Loads for E = 1 kPa: displacement depends on force over stiffness alone.
-    pressed = np.moveaxis(area[:, None] * traction / tissue.young_kpa, 0, -1)
-    loads = np.ascontiguousarray(np.moveaxis(embedding.gather(pressed), -1, 0))
+    vertex_force = np.moveaxis(area[:, None] * traction / tissue.young_kpa, 0, -1)
+    loads = np.ascontiguousarray(np.moveaxis(embedding.gather(vertex_force), -1, 0))
     system = tissue.equations(tets)
-    height, raising = np.zeros(frames), np.zeros_like(tets.points)
+    height, uplift = np.zeros(frames), np.zeros_like(tets.points)
     if pulse is not None:
-        height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
-        loads += height[:, None, None] * raising
-    with _naming(gestures, tissue.young_kpa):
+        height, uplift = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
+        loads += height[:, None, None] * uplift
+    with _explain_error(gestures, tissue.young_kpa):
         if scheme.time == "dynamic" or scheme.relaxation:
             path = march_in_time(tets, tissue, loads, load_parameter, clock(scheme, fps, tets))
         else:
             path = solve_path(system, loads, load_parameter)
-    moved = embedding.move(np.ascontiguousarray(np.moveaxis(path.displacement, 0, -1)))
-    displacement = np.ascontiguousarray(np.moveaxis(moved, -1, 0))
+    vertex_motion = embedding.move(np.ascontiguousarray(np.moveaxis(path.displacement, 0, -1)))
+    displacement = np.ascontiguousarray(np.moveaxis(vertex_motion, -1, 0))
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
-    raised = embedding.move(system.solve(raising))
-    pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
+    lift_motion = embedding.move(system.solve(uplift))
+    pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, lift_motion, optimize=True)
     return Deformation(
         displacement=displacement,
         traction=traction,
@@ -100,7 +102,7 @@ def deform(
     )
 
 
-def _driven(
+def _deform_driven(
     scheme: TimeScheme,
     tissue: Tissue,
     tools: Sequence[tuple[Gesture, ToolMotion]],
@@ -109,33 +111,33 @@ def _driven(
     surface: Shape,
     frames: int,
     fps: float,
-    lifted: tuple[Pulse, float] | None,
+    pulse_opening: tuple[Pulse, float] | None,
     inside: bool,
 ) -> Deformation:
-    """Deformation by instruments that hold the tissue under them, as `deform`; `lifted`: pulse, opening."""
+    """As `deform`, by instruments that hold the tissue under them; `pulse_opening`: pulse, radius."""
     system, area = tissue.equations(tets), surface_embedding.vertex_area(*surface)
     gestures, motions = [gesture for gesture, _ in tools], [motion for _, motion in tools]
-    held = driven_contact.layers(gestures, tissue, embedding, surface.vertices, area)
-    height, raising = np.zeros(frames), np.zeros_like(tets.points)
-    if lifted is not None:
-        pulse, opening_mm = lifted
-        height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
-    time, loads = clock(scheme, fps, tets), height[:, None, None] * raising
-    path = driven_contact.follow(system, tissue.young_kpa, held, motions, time, loads)
+    layers = driven_contact.build_layers(gestures, tissue, embedding, surface.vertices, area)
+    height, uplift = np.zeros(frames), np.zeros_like(tets.points)
+    if pulse_opening is not None:
+        pulse, opening_mm = pulse_opening
+        height, uplift = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
+    time_steps, loads = clock(scheme, fps, tets), height[:, None, None] * uplift
+    path = driven_contact.follow(system, tissue.young_kpa, layers, motions, time_steps, loads)
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     traction, parts = np.zeros_like(displacement), np.zeros((frames, len(tools), 3))
     for t in range(frames):
-        for k in np.flatnonzero(path.holds[t]).tolist():
-            part = tissue.young_kpa * held[k].traction(path.displacement[t], path.way[t, k])
+        for k in np.flatnonzero(path.in_contact[t]).tolist():
+            part = tissue.young_kpa * layers[k].traction(path.displacement[t], path.travel[t, k])
             traction[t] += part
             parts[t, k] = area @ part
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
-    raised = embedding.move(system.solve(raising))
-    pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
+    lift_motion = embedding.move(system.solve(uplift))
+    pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, lift_motion, optimize=True)
     tips, shafts = np.zeros((frames, 2 * len(tools), 3)), np.zeros((frames, 2 * len(tools), 3))
     for number, (gesture, motion) in enumerate(tools):
-        of = slice(2 * number, 2 * number + 2)
-        tips[:, of], shafts[:, of] = tool_gesture.pose(
+        pair = slice(2 * number, 2 * number + 2)
+        tips[:, pair], shafts[:, pair] = tool_gesture.pose(
             gesture, motion, surface, surface.vertices + displacement
         )
     return Deformation(
@@ -160,16 +162,19 @@ def _volume(tissue: Tissue, system: System, tets: Tets, displacement: Floats) ->
 
 
 @contextmanager
-def _naming(gestures: Sequence[Gesture], young_kpa: float) -> Iterator[None]:
+def _explain_error(gestures: Sequence[Gesture], young_kpa: float) -> Iterator[None]:
     """Adds force, radius and stiffness to an error of the block, whose numbers are per stiffness."""
     try:
         yield
     except UserError as error:
-        each = [f"{one.kind} {_size_of(one)}, radius {one.footprint_mm:.3g} mm" for one in gestures]
-        raise type(error)(f"{error}: {', '.join(each)}, E {young_kpa:.3g} kPa") from None
+        contacts = [
+            f"{gesture.kind} {_describe_size(gesture)}, radius {gesture.footprint_mm:.3g} mm"
+            for gesture in gestures
+        ]
+        raise type(error)(f"{error}: {', '.join(contacts)}, E {young_kpa:.3g} kPa") from None
 
 
-def _size_of(gesture: Gesture) -> str:
+def _describe_size(gesture: Gesture) -> str:
     if gesture.drive is not None and gesture.drive.travel_mm is not None:
         return f"{gesture.drive.travel_mm:.3g} mm"
     return f"{gesture.force_mn:.3g} mN"
@@ -200,13 +205,13 @@ def _instruments(
     tools: Sequence[tuple[Gesture, ToolMotion]], surface: Shape, displacement: Floats
 ) -> dict[str, Floats]:
     """Force, its parts, and poses, named as in `Deformation`; `displacement` (T, V, 3) mm."""
-    none = np.zeros((len(displacement), 0, 3))
-    parts, tips, shafts = [none], [none], [none]
+    empty = np.zeros((len(displacement), 0, 3))
+    parts, tips, shafts = [empty], [empty], [empty]
     for gesture, motion in tools:
         peak = np.sum([contact.force_mn for contact in gesture.contacts], axis=0)
         parts.append(np.outer(motion.load, peak)[:, None])
         tip, shaft = tool_gesture.pose(gesture, motion, surface, surface.vertices + displacement)
         tips.append(tip)
         shafts.append(shaft)
-    by_instrument, tip, shaft = (np.concatenate(of, axis=1) for of in (parts, tips, shafts))
+    by_instrument, tip, shaft = (np.concatenate(arrays, axis=1) for arrays in (parts, tips, shafts))
     return {"force": by_instrument.sum(axis=1), "by_instrument": by_instrument, "tip": tip, "shaft": shaft}

@@ -38,19 +38,19 @@ class Embedding:
 
     def move(self, u: Floats) -> Floats:
         """Displacement (V, 3, ...) mm of the points, from the nodes' (N, 3, ...) mm."""
-        moved = (self.value @ u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
+        motion = (self.value @ u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
         spin = self.spin @ u.reshape(3 * len(u), -1)
-        turned = self.corner @ (self.mean @ spin.reshape(len(self.mean), -1))
-        return np.asarray(moved + np.cross(turned.reshape(moved.shape), self._arm(moved), axis=1))
+        rotation = self.corner @ (self.mean @ spin.reshape(len(self.mean), -1))
+        return np.asarray(motion + np.cross(rotation.reshape(motion.shape), self._arm(motion), axis=1))
 
     def gather(self, force: Floats) -> Floats:
         """Nodal forces (N, 3, ...) mN, from those at the points, (V, 3, ...) mN."""
-        loaded = np.flatnonzero(force.reshape(len(force), -1).any(axis=1))  # few of them, as a rule
+        rows = np.flatnonzero(force.reshape(len(force), -1).any(axis=1))  # few of them, as a rule
         width = int(np.prod(force.shape[1:]))
-        flat = force[loaded].reshape(len(loaded), width)
-        moment = np.cross(self._arm(force)[loaded], force[loaded], axis=1).reshape(flat.shape)
-        nodal = (self.value[loaded].T @ flat).reshape(-1, *force.shape[1:])
-        couple = self.mean.T @ (self.corner[loaded].T @ moment)
+        flat = force[rows].reshape(len(rows), width)
+        moment = np.cross(self._arm(force)[rows], force[rows], axis=1).reshape(flat.shape)
+        nodal = (self.value[rows].T @ flat).reshape(-1, *force.shape[1:])
+        couple = self.mean.T @ (self.corner[rows].T @ moment)
         couple = self.spin.T @ couple.reshape(self.spin.shape[0], width // 3)
         return np.asarray(nodal + couple.reshape(nodal.shape))
 
@@ -60,23 +60,23 @@ class Embedding:
 
 def embed(tets: Tets, vertices: Floats) -> Embedding:
     """Attaches the vertices (V, 3) mm of a surface to the nearest outer faces of a volume."""
-    owner, off = outer_faces(tets.cells)
-    faces = FACES[off]
+    owner, apex = outer_faces(tets.cells)
+    faces = FACES[apex]
     nodes = tets.cells[owner[:, None], faces]
     corner = np.ascontiguousarray(tets.points[nodes])
-    face, on_face = nearest(corner, as_constant(np.ascontiguousarray(vertices)))
+    face, on_face = find_nearest(corner, as_constant(np.ascontiguousarray(vertices)))
     bary = np.zeros((len(vertices), 4))
     np.put_along_axis(bary, faces[face], on_face, axis=1)
     value = sparse_rows(shape(bary), tets.cells[owner[face]], len(tets.points))
-    used = np.unique(face)
-    corners, local = np.unique(nodes[used], return_inverse=True)
+    used_faces = np.unique(face)
+    corners, local = np.unique(nodes[used_faces], return_inverse=True)
     local = local.reshape(-1, 3)
-    mean, lumped = _averaging(tets.points[nodes[used]], local, len(corners))
+    mean, lumped = _averaging(tets.points[nodes[used_faces]], local, len(corners))
     return Embedding(
         value,
-        sparse_rows(on_face, local[np.searchsorted(used, face)], len(corners)),
+        sparse_rows(on_face, local[np.searchsorted(used_faces, face)], len(corners)),
         mean,
-        _half_curl(tets, owner[used], faces[used], local, lumped),
+        _half_curl(tets, owner[used_faces], faces[used_faces], local, lumped),
         vertices - value @ tets.points,
     )
 
@@ -84,9 +84,9 @@ def embed(tets: Tets, vertices: Floats) -> Embedding:
 def sparse_rows(values: Floats, columns: Ints, width: int) -> sp.csr_array:
     """Rows (V, n) of values at columns, as (V, width)."""
     rows = np.repeat(np.arange(len(values)), values.shape[1])
-    whole = sp.coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width)).tocsr()
-    whole.eliminate_zeros()
-    return whole
+    matrix = sp.coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width)).tocsr()
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]:
@@ -99,11 +99,11 @@ def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]
     sides = np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1)  # each opposite its corner
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     stiff = np.einsum("fid,fjd->fij", sides, sides) / (4 * area[:, None, None])
-    whole = np.zeros((count, count))
-    np.add.at(whole, (local[:, :, None], local[:, None, :]), _EVEN_MM**2 * stiff)
+    matrix = np.zeros((count, count))
+    np.add.at(matrix, (local[:, :, None], local[:, None, :]), _EVEN_MM**2 * stiff)
     mass = np.bincount(local.ravel(), np.repeat(area / 3, 3), count)
-    whole[np.diag_indices(count)] += mass
-    return np.asarray(np.linalg.inv(whole) * mass), (area / 3)[:, None] / mass[local]
+    matrix[np.diag_indices(count)] += mass
+    return np.asarray(np.linalg.inv(matrix) * mass), (area / 3)[:, None] / mass[local]
 
 
 def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats) -> sp.csr_array:
@@ -115,11 +115,11 @@ def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats)
     gradient = gradients(tets.points[tets.cells[owner]], np.eye(4))[0]  # (F, 4, n, 3)
     gradient = 0.5 * share[:, :, None, None] * np.take_along_axis(gradient, faces[:, :, None, None], axis=1)
     nodes = np.broadcast_to(tets.cells[owner][:, None, :], gradient.shape[:3])
-    at = np.broadcast_to(local[:, :, None], gradient.shape[:3])
+    corners = np.broadcast_to(local[:, :, None], gradient.shape[:3])
     # curl_i = d_j u_k - d_k u_j
     parts = [(i, k, gradient[..., j]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
     parts += [(i, j, -gradient[..., k]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
-    rows = np.concatenate([(3 * at + i).ravel() for i, _, _ in parts])
+    rows = np.concatenate([(3 * corners + i).ravel() for i, _, _ in parts])
     columns = np.concatenate([(3 * nodes + k).ravel() for _, k, _ in parts])
     values = np.concatenate([value.ravel() for _, _, value in parts])
     size = (3 * (int(local.max()) + 1), 3 * len(tets.points))
@@ -135,7 +135,7 @@ def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
 
 @argument_types("f8[:,:,::1], Array(f8, 2, 'C', readonly=True)")
 @compiled
-def nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
+def find_nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
     """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the nearest point."""
     count = len(corner)
     low, high = np.empty((count, 3)), np.empty((count, 3))

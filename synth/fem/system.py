@@ -62,9 +62,9 @@ class System:
     def state(self, u: Floats) -> State:
         """Energy and forces at (N, 3) mm."""
         strain = _strain(self.mesh, u)
-        answer, energy = self._stress(strain)
+        piola, energy = self._stress(strain)
         force = np.empty_like(u)
-        divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
+        divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, piola, force)
         spring = self.springs(u)
         energy += 0.5 * float(np.vdot(u, spring))
         force += spring
@@ -81,26 +81,26 @@ class System:
             sigma = sigma @ f.swapaxes(1, 2) / np.linalg.det(f)[:, None, None]
         cells, weight = self.mesh.cells, self.mesh.weight
         parts = sigma[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]].reshape(*weight.shape, 6)
-        whole, volume = np.zeros((len(u), 6)), np.zeros(len(u))
-        np.add.at(whole, cells, np.einsum("mq,mqk->mk", weight, parts)[:, None])
+        total, volume = np.zeros((len(u), 6)), np.zeros(len(u))
+        np.add.at(total, cells, np.einsum("mq,mqk->mk", weight, parts)[:, None])
         np.add.at(volume, cells, weight.sum(axis=1)[:, None])
-        return whole / volume[:, None]
+        return total / volume[:, None]
 
     def _stress(self, strain: Floats) -> tuple[Floats, float]:
         """First Piola-Kirchhoff stress (M * Q, 3, 3) kPa and energy mN mm at displacement gradients."""
         (mu, lam), weight = lame(1.0, self.poisson), self.mesh.weight
-        answer, density = np.empty_like(strain), np.empty(len(strain))
+        piola, density = np.empty_like(strain), np.empty(len(strain))
         if self.law == "ogden":
-            ogden.stress(strain, mu, lam - self.averaged, self.alpha, answer, density)
+            ogden.stress(strain, mu, lam - self.averaged, self.alpha, piola, density)
         elif self.law in NUMBER:
-            stress(NUMBER[self.law], strain, mu, lam - self.averaged, answer, density)
+            stress(NUMBER[self.law], strain, mu, lam - self.averaged, piola, density)
         else:
-            foreign_law.stress(self.law, strain, mu, lam - self.averaged, answer, density)
+            foreign_law.stress(self.law, strain, mu, lam - self.averaged, piola, density)
         energy = float(density @ weight.ravel())
         if self.averaged:
             swelling = NUMBER.get(self.law, NUMBER["neo-hookean"])  # of Ogden's and of a plug-in: log J
-            energy += resist_swelling(swelling, strain, weight, self.averaged, answer)
-        return answer, energy
+            energy += resist_swelling(swelling, strain, weight, self.averaged, piola)
+        return piola, energy
 
     def springs(self, u: Floats) -> Floats:
         """Force (N, 3) mN of the springs at (N, 3) mm."""
@@ -109,11 +109,11 @@ class System:
 
     def least_jacobian(self, u: Floats) -> tuple[float, int]:
         """Smallest det F at (N, 3) mm and its element, corners included: under a contact it is there."""
-        found = []
+        minima = []
         for mesh in (self.mesh, self.corners):
-            least, at = least_determinant(_strain(mesh, u))
-            found.append((float(least), int(at) // mesh.weight.shape[1]))
-        return min(found)
+            least, index = least_determinant(_strain(mesh, u))
+            minima.append((float(least), int(index) // mesh.weight.shape[1]))
+        return min(minima)
 
 
 def assemble(
@@ -129,22 +129,22 @@ def assemble(
         flat = f"is flat or inside out (mean ratio {shape.min():.1e})"
         raise UserError(f"the mesh's element {shape.argmin()} {flat}")
     mesh = quadrature(tets.points, tets.cells)
-    whole, mean = tissue_stiffness(mesh, poisson)
-    whole = (whole + springs(tets)).tocsr()
+    matrix, mean_lambda = tissue_stiffness(mesh, poisson)
+    matrix = (matrix + springs(tets)).tocsr()
     membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
     if membrane is not None:
-        whole = (whole + membrane.rest_stiffness()).tocsr()
+        matrix = (matrix + membrane.rest_stiffness()).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
-    factor = factorise(whole, free)
+    factor = factorise(matrix, free)
     corners = quadrature(tets.points, tets.cells, np.eye(4))
-    parts = mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip
+    parts = mesh, law, poisson, free, tets.hold, matrix, factor, corners, membrane, mean_lambda, tets.slip
     return System(*parts, alpha)
 
 
-def factorise(whole: sp.csr_array, free: Ints) -> SuperLU:
+def factorise(matrix: sp.csr_array, free: Ints) -> SuperLU:
     """Factor of the free part of a stiffness (3N, 3N), symmetric and positive definite there."""
     # No pivoting, an ordering of A + A'.
-    inner, symmetric = whole[free][:, free].tocsc(), {"SymmetricMode": True}
+    inner, symmetric = matrix[free][:, free].tocsc(), {"SymmetricMode": True}
     return splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
 
 
@@ -152,28 +152,28 @@ def tissue_stiffness(mesh: Quadrature, poisson: float) -> tuple[sp.csr_array, fl
     """Stiffness (3N, 3N) mN/mm of the tissue alone at rest, and the part of lambda [kPa] that acts on
     elements' means."""
     mu, lam = lame(1.0, poisson)
-    mean = max(lam - POINTWISE * mu, 0.0)
-    along = None
-    if mean:
-        even = np.broadcast_to(np.eye(3), (*mesh.weight.shape, 3, 3))  # the swelling's derivative at rest
-        along = np.einsum("eq,eqij,eqnj->eni", mesh.weight, even, mesh.slope, optimize=True)
-        along *= np.sqrt(mean / mesh.weight.sum(axis=1))[:, None, None]
+    mean_lambda = max(lam - POINTWISE * mu, 0.0)
+    swelling_gradient = None
+    if mean_lambda:
+        slope = np.broadcast_to(np.eye(3), (*mesh.weight.shape, 3, 3))  # the swelling's derivative at rest
+        swelling_gradient = np.einsum("eq,eqij,eqnj->eni", mesh.weight, slope, mesh.slope, optimize=True)
+        swelling_gradient *= np.sqrt(mean_lambda / mesh.weight.sum(axis=1))[:, None, None]
     moduli = hooke(1.0, poisson)
-    moduli -= mean * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
-    return stiffness(mesh, moduli, along), mean
+    moduli -= mean_lambda * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
+    return stiffness(mesh, moduli, swelling_gradient), mean_lambda
 
 
 def springs(tets: Tets) -> sp.csr_array:
     """Stiffness (3N, 3N) mN/mm of the skull and of attachments."""
-    whole = sp.kron(tets.hold, np.eye(3), format="csr")
-    return sp.csr_array(whole if tets.slip is None else whole + tets.slip)
+    matrix = sp.kron(tets.hold, np.eye(3), format="csr")
+    return sp.csr_array(matrix if tets.slip is None else matrix + tets.slip)
 
 
 def hooke(young: float, poisson: float) -> Floats:
     """Moduli of Hooke's law, (1, 3, 3, 3, 3) in the unit of `young`: the tangent of every law at rest."""
-    (mu, lam), one = lame(young, poisson), np.eye(3)
-    alike = np.einsum("ik,jm->ijkm", one, one) + np.einsum("im,jk->ijkm", one, one)
-    return np.asarray(mu * alike + lam * np.einsum("ij,km->ijkm", one, one))[None]
+    (mu, lam), identity = lame(young, poisson), np.eye(3)
+    shear = np.einsum("ik,jm->ijkm", identity, identity) + np.einsum("im,jk->ijkm", identity, identity)
+    return np.asarray(mu * shear + lam * np.einsum("ij,km->ijkm", identity, identity))[None]
 
 
 def _strain(mesh: Quadrature, u: Floats) -> Floats:

@@ -34,18 +34,18 @@ def linearise(system: System, u: Floats) -> System:
     volume = weight.sum(axis=1)
     mean = np.einsum("eq,eq->e", weight, swelling) / volume
     pressure = np.repeat(system.averaged * mean, weight.shape[1])
-    moduli, along = positive_tangent(system, strain, pressure), None
+    moduli, swelling_gradient = positive_tangent(system, strain, pressure), None
     if system.averaged:
         slope = np.linalg.inv(f).swapaxes(1, 2).reshape(*weight.shape, 3, 3)
-        along = np.einsum("eq,eqij,eqnj->eni", weight, slope, mesh.slope, optimize=True)
-        along *= np.sqrt(system.averaged / volume)[:, None, None]
-    whole = stiffness(mesh, moduli, along) + sp.kron(system.hold, np.eye(3), format="csr")
+        swelling_gradient = np.einsum("eq,eqij,eqnj->eni", weight, slope, mesh.slope, optimize=True)
+        swelling_gradient *= np.sqrt(system.averaged / volume)[:, None, None]
+    matrix = stiffness(mesh, moduli, swelling_gradient) + sp.kron(system.hold, np.eye(3), format="csr")
     if system.slip is not None:
-        whole = whole + system.slip
+        matrix = matrix + system.slip
     if system.membrane is not None:
-        whole = whole + system.membrane.stiffness_at(u)
-    whole = sp.csr_array(whole)
-    return replace(system, stiffness=whole, factor=factorise(whole, system.free))
+        matrix = matrix + system.membrane.stiffness_at(u)
+    matrix = sp.csr_array(matrix)
+    return replace(system, stiffness=matrix, factor=factorise(matrix, system.free))
 
 
 def positive_tangent(system: System, strain: Floats, pressure: Floats) -> Floats:
@@ -55,20 +55,20 @@ def positive_tangent(system: System, strain: Floats, pressure: Floats) -> Floats
     if system.law == "ogden":
         return ogden.tangent(strain, mu, lam - averaged, system.alpha, pressure, positive=True)
 
-    def first(h: Floats) -> Floats:
-        answer, density = np.empty_like(h), np.empty(len(h))
+    def evaluate_piola(h: Floats) -> Floats:
+        piola, density = np.empty_like(h), np.empty(len(h))
         if system.law in NUMBER:
-            stress(NUMBER[system.law], h, mu, lam - averaged, answer, density)
+            stress(NUMBER[system.law], h, mu, lam - averaged, piola, density)
         else:
-            foreign_law.stress(system.law, h, mu, lam - averaged, answer, density)
-        return answer + pressure[:, None, None] * np.linalg.inv(h + np.eye(3)).swapaxes(1, 2)
+            foreign_law.stress(system.law, h, mu, lam - averaged, piola, density)
+        return piola + pressure[:, None, None] * np.linalg.inv(h + np.eye(3)).swapaxes(1, 2)
 
     out = np.empty((len(strain), 9, 9))
     for k in range(9):
         step = np.zeros(9)
         step[k] = _STEP
-        change = first(strain + step.reshape(3, 3)) - first(strain - step.reshape(3, 3))
+        change = evaluate_piola(strain + step.reshape(3, 3)) - evaluate_piola(strain - step.reshape(3, 3))
         out[:, :, k] = change.reshape(-1, 9) / (2 * _STEP)
-    size, way = np.linalg.eigh(0.5 * (out + out.swapaxes(1, 2)))
-    out = (way * np.maximum(size, 0)[:, None]) @ way.swapaxes(1, 2)
+    eigenvalues, eigenvectors = np.linalg.eigh(0.5 * (out + out.swapaxes(1, 2)))
+    out = (eigenvectors * np.maximum(eigenvalues, 0)[:, None]) @ eigenvectors.swapaxes(1, 2)
     return np.asarray(out.reshape(-1, 3, 3, 3, 3))

@@ -64,12 +64,12 @@ class Gesture:
     timing: tuple[float, float, float, float]  # touch, full load, start of its fall, release: sequence parts
     drive: Drive | None = None  # of a contact that is driven: loads and forces above are then 0 if not given
 
-    def ways(self, way_mm: float) -> Floats:
-        """Ways (C, 3) mm of its tips where it is `way_mm` along its path; tips of a grasp close first."""
-        ways = np.tile(way_mm * np.asarray(self.direction), (len(self.contacts), 1))
+    def tip_offsets(self, travel_mm: float) -> Floats:
+        """Offsets (C, 3) mm of its tips `travel_mm` along its path; tips of a grasp close first."""
+        offsets = np.tile(travel_mm * np.asarray(self.direction), (len(self.contacts), 1))
         if self.drive is not None and len(self.contacts) == 2:
-            ways[:, :2] -= self.drive.closing_mm * _smooth(way_mm / CLOSED_MM) * _unit(self.sides)
-        return ways
+            offsets[:, :2] -= self.drive.closing_mm * _smooth(travel_mm / CLOSED_MM) * _unit(self.sides)
+        return offsets
 
     @property
     def axes(self) -> Floats:
@@ -81,7 +81,7 @@ class Gesture:
         if self.drive is not None:
             size = 0.5 * np.asarray(self.drive.size_mm)
         else:
-            along = form(self.kind, self.instrument)
+            along = aspect_ratio(self.kind, self.instrument)
             size = self.footprint_mm * np.sqrt([along, 1 / along])
             size *= _RING_SIZE if self.instrument == "suction" else 1.0
         return np.asarray(size[:, None] * [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -126,7 +126,7 @@ class ToolMotion:
     """(T, 2) mm that the contacts have slid over the surface at rest."""
 
 
-def form(kind: str, instrument: str) -> float:
+def aspect_ratio(kind: str, instrument: str) -> float:
     """Length of an instrument's contact along it over the width; 1 is round."""
     return _FACE if (kind, instrument) == ("retract", "spatula") else _ASPECTS.get(instrument, 1.0)
 
@@ -148,30 +148,30 @@ def grip(
     return np.stack([point - aside, point + aside]), np.stack(directions)
 
 
-def clearance(one: Gesture, other: Gesture) -> float:
+def clearance(gesture: Gesture, other: Gesture) -> float:
     """Distance of two gestures' contacts beyond the clearance they need, mm."""
-    here, there = np.array(one.focus), np.array(other.focus)
-    apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
-    return float((apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min())
+    focus, other_focus = np.array(gesture.focus), np.array(other.focus)
+    distance = np.linalg.norm(focus[:, None, :2] - other_focus[None, :, :2], axis=2)
+    return float((distance - _OVERLAP * (focus[:, None, 2] + other_focus[None, :, 2])).min())
 
 
 def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
     """The gesture's own motion over T frames."""
     t = np.linspace(0, 1, frames)
-    touch, full, fall, leave = gesture.timing
+    touch, full, fall, release = gesture.timing
     if gesture.taps > 1:
-        phase = np.clip((t - touch) / (leave - touch), 0, 1) * gesture.taps
-        load = np.sin(np.pi * (phase % 1)) ** 2 * ((t > touch) & (t < leave))
-        lifted = 0.15 * np.cos(np.pi * (phase % 1)) ** 2
+        phase = np.clip((t - touch) / (release - touch), 0, 1) * gesture.taps
+        load = np.sin(np.pi * (phase % 1)) ** 2 * ((t > touch) & (t < release))
+        lift = 0.15 * np.cos(np.pi * (phase % 1)) ** 2
     else:
-        load = _smooth((t - touch) / (full - touch)) * (1 - _smooth((t - fall) / (leave - fall)))
-        lifted = np.zeros(frames)
-    away = 1 - _smooth(t / touch) + _smooth((t - leave) / (1 - leave))
-    slid = _smooth((t - full) / max(fall - full, 1e-9))
+        load = _smooth((t - touch) / (full - touch)) * (1 - _smooth((t - fall) / (release - fall)))
+        lift = np.zeros(frames)
+    away = 1 - _smooth(t / touch) + _smooth((t - release) / (1 - release))
+    slide = _smooth((t - full) / max(fall - full, 1e-9))
     # The rest frame is the first one, whatever the timing.
     load[0] = 0.0
-    shift = slid[:, None] * np.asarray(gesture.path_mm)
-    return ToolMotion(load, np.maximum(away, lifted * (load < 1e-3)), shift)
+    shift = slide[:, None] * np.asarray(gesture.path_mm)
+    return ToolMotion(load, np.maximum(away, lift * (load < 1e-3)), shift)
 
 
 def check_motions(
@@ -185,7 +185,9 @@ def check_motions(
             value = check_answer(f"motions[{k}]", name, getattr(motion, name), shape)
             if name != "away" and value[0].any():
                 raise UserError(f"motions[{k}]: {name}: is not 0 in frame 0, the rest frame")
-    return [ToolMotion(*(np.asarray(value, np.float64) for value in vars(one).values())) for one in motions]
+    return [
+        ToolMotion(*(np.asarray(value, np.float64) for value in vars(motion).values())) for motion in motions
+    ]
 
 
 def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floats) -> Floats:
@@ -194,12 +196,12 @@ def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floa
     out = np.zeros((len(motion.load), len(vertices), 3))
     for contact in gesture.contacts:
         start = np.asarray(contact.point_mm)
-        under = gesture.axes, vertices, area, gesture.instrument == "suction"
-        kernel = footprint(start, *under)
+        contact_args = gesture.axes, vertices, area, gesture.instrument == "suction"
+        kernel = footprint(start, *contact_args)
         for t, part in enumerate(motion.load):
             if part > 0:
                 if motion.shift[t].any():
-                    kernel = footprint(start + motion.shift[t], *under)
+                    kernel = footprint(start + motion.shift[t], *contact_args)
                 out[t] += np.outer(part * kernel, contact.force_mn)
     return out
 
@@ -213,8 +215,8 @@ def footprint(
     `area`: (V, 3) mm at rest, (V,) mm^2; `ring`: the kernel is that of the distance from a ring in its outer
     part. UserError: fewer than 3 vertices lie under the contact.
     """
-    flat = np.hypot(*(vertices[:, :2] - centre).T)
-    middle = np.append(centre, vertices[flat.argmin(), 2])
+    distance = np.hypot(*(vertices[:, :2] - centre).T)
+    middle = np.append(centre, vertices[distance.argmin(), 2])
     axes = np.eye(3)
     axes[:2, :2] = size if np.ndim(size) else size * np.eye(2)
     radius_mm = axes[2, 2] = float(np.sqrt(np.linalg.det(axes)))
@@ -224,35 +226,40 @@ def footprint(
     kernel = (1 - np.minimum(reach, 1) ** 2) ** 2
     total = float(kernel @ area)
     if np.count_nonzero(kernel) < 3 or total <= 0:
-        few = f"{radius_mm / (_RING_SIZE if ring else 1):.3g} mm covers fewer than 3 vertices of the surface"
-        raise UserError(f"fem.footprint_mm: {few}; raise it, or anatomy.vertices")
+        reason = (
+            f"{radius_mm / (_RING_SIZE if ring else 1):.3g} mm covers fewer than 3 vertices of the surface"
+        )
+        raise UserError(f"fem.footprint_mm: {reason}; raise it, or anatomy.vertices")
     return np.asarray(kernel / total)
 
 
-def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
+def find_anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
     """Points where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
     UserError: they are beyond the edge of the surface."""
     aside = gesture.sides
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(motion.shift).max() + 3 * gesture.footprint_mm
     corner = surface.vertices[surface.faces, :2]
-    near = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
+    close_faces = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
     places = (start + motion.shift)[:, None] + aside
-    once, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
-    found = [_find_under(place, surface.vertices, near) for place in once]
+    unique_places, place_index = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
+    contacts = [_find_under(place, surface.vertices, close_faces) for place in unique_places]
     shape = (*places.shape[:2], 3)
-    corners, weights = (np.array(of)[which.ravel()].reshape(shape) for of in zip(*found, strict=True))
+    corners, weights = (
+        np.array(values)[place_index.ravel()].reshape(shape) for values in zip(*contacts, strict=True)
+    )
     return corners, weights
 
 
-def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) -> tuple[Floats, Floats]:
+def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, positions: Floats) -> tuple[Floats, Floats]:
     """Tips (T, 2, 3) mm of the instrument, which rest on the tissue while they load it, and unit vectors (T,
-    2, 3) from tip to hand, of a surface at rest whose vertices move (T, V, 3) mm. Raises as `anchors`."""
-    corners, weights = anchors(gesture, motion, surface)
-    each = zip(weights, corners, moved, strict=True)
-    touched = np.stack([np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in each])
-    tips = touched + gesture.hover_mm * motion.away[:, None, None] * gesture.shaft
-    return tips, np.broadcast_to(gesture.shaft, touched.shape).copy()
+    2, 3) from tip to hand; `surface` is at rest, its vertices go to `positions` (T, V, 3) mm. Raises as
+    `find_anchors`."""
+    corners, weights = find_anchors(gesture, motion, surface)
+    frames = zip(weights, corners, positions, strict=True)
+    contact_points = np.stack([np.einsum("kc,kcd->kd", w, vertices[c]) for w, c, vertices in frames])
+    tips = contact_points + gesture.hover_mm * motion.away[:, None, None] * gesture.shaft
+    return tips, np.broadcast_to(gesture.shaft, contact_points.shape).copy()
 
 
 def _aside(spread_mm: float, azimuth_deg: float) -> Floats:

@@ -14,7 +14,7 @@ from synth.arrays import Floats, Map, Mask, Pixels
 from synth.fit.photograph import Photograph, measure
 from synth.job.schema import Family, Job, LightSection
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera_sensor import CameraSensor, balanced_light, processed
+from synth.render.camera.camera_sensor import CameraSensor, expose, process_colours
 from synth.render.camera.colour_processing import PLAIN, ColourProcessing
 from synth.render.scene import SceneState
 from synth.sequence.rest_scene import at_rest
@@ -57,38 +57,45 @@ class TissueFrame(NamedTuple):
     def light(self, keys: dict[str, Any]) -> Map:
         """The sensor's signal (N, 3) on tissue, white-balanced, 1 at full scale."""
         sensor = replace(self.sensor, **keys)
-        return balanced_light(self.radiance, sensor, np.random.default_rng(0))[self.usable]
+        return expose(self.radiance, sensor, np.random.default_rng(0))[self.usable]
 
 
-def fit_camera(given: Photograph) -> dict[str, Any]:
+def fit_camera(photograph: Photograph) -> dict[str, Any]:
     """Sections of a job with the photograph's family and camera.
 
     Frames of that family are recorded with rising vignette, blur and noise, of which those are chosen that
     reproduce the photograph's statistics. Colours are fitted to the signal of that camera.
     """
-    theirs, video = measure(given.rgb, given.usable), given.rgb[given.usable] / 255
-    widest = int(min(given.rgb.shape[1], _LARGEST_PX, _LARGEST_MM / given.mm_per_px)) // 4 * 4
-    small = {name: render(name, min(_CHOOSING_PX, widest), given.mm_per_px, 0) for name in get_args(Family)}
-    family = min(small, key=lambda name: fit_colours(small[name].light({}), video)[1])  # the closest
-    frames = [render(family, widest, given.mm_per_px, index) for index in range(_ANATOMIES)]
-    reach = widest / given.rgb.shape[1]
+    target, video = measure(photograph.rgb, photograph.usable), photograph.rgb[photograph.usable] / 255
+    widest = int(min(photograph.rgb.shape[1], _LARGEST_PX, _LARGEST_MM / photograph.mm_per_px)) // 4 * 4
+    candidates = {
+        name: render(name, min(_CHOOSING_PX, widest), photograph.mm_per_px, 0) for name in get_args(Family)
+    }
+    family = min(
+        candidates, key=lambda name: fit_colours(candidates[name].light({}), video)[1]
+    )  # the closest
+    frames = [render(family, widest, photograph.mm_per_px, index) for index in range(_ANATOMIES)]
+    reach = widest / photograph.rgb.shape[1]
 
-    def here(keys: dict[str, Any]) -> dict[str, Any]:
+    def scale_vignette(keys: dict[str, Any]) -> dict[str, Any]:
         return keys | {"vignette": keys["vignette"] * reach**2}  # frames show the photograph's middle
 
     def figure(name: str, keys: dict[str, Any]) -> float:
-        taken = ((given.compression.apply(one.record(here(keys))), one.usable) for one in frames)
-        return float(np.mean([measure(*one, reach)[name] for one in taken]))
+        recordings = (
+            (photograph.compression.apply(frame.record(scale_vignette(keys))), frame.usable)
+            for frame in frames
+        )
+        return float(np.mean([measure(*recording, reach)[name] for recording in recordings]))
 
     keys: dict[str, Any] = {"vignette": _USUAL.vignette}
-    for name, (tried, as_keys) in _TRIED.items():
-        measured = np.maximum.accumulate([figure(name, keys | as_keys(value)) for value in tried])
-        keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
-    light = np.concatenate([one.light(here(keys)) for one in frames])
+    for name, (values, as_keys) in _TRIED.items():
+        statistics = np.maximum.accumulate([figure(name, keys | as_keys(value)) for value in values])
+        keys |= as_keys(float(np.interp(target[name], statistics, values)))
+    light = np.concatenate([frame.light(scale_vignette(keys)) for frame in frames])
     keys |= fit_colours(light, video)[0]._asdict()
     sensor = {name: np.round(value, 4).tolist() for name, value in keys.items()}
-    rate = given.compression.bitrate_mbps(frames[0].record(keys))
-    sensor |= {"blur_px": sensor.pop("blur"), "chroma": given.compression.chroma, "bitrate_mbps": rate}
+    rate = photograph.compression.bitrate_mbps(frames[0].record(keys))
+    sensor |= {"blur_px": sensor.pop("blur"), "chroma": photograph.compression.chroma, "bitrate_mbps": rate}
     return {"appearance": {"families": [family]}, "sensor": sensor}
 
 
@@ -99,8 +106,8 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFr
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "scenery": []}
     # A picture doesn't tell a lamp's fall-off from the lens': that of a usual lamp is left to the lamp.
     light = {"even": [_EVEN, _EVEN]}
-    drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}, "light": light}
-    scene = at_rest(Job.model_validate({"anatomy": anatomy, "render": view, **drawn}), index)
+    sections = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}, "light": light}
+    scene = at_rest(Job.model_validate({"anatomy": anatomy, "render": view, **sections}), index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
@@ -115,9 +122,9 @@ def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     which the photograph varies little have more weight, as lightness would dominate hue. `light`: (N, 3) as
     of `TissueFrame.light`; `video`: (M, 3) levels of the photograph's tissue, 0 to 1.
     """
-    rng, plain = np.random.default_rng(0), np.array(PLAIN.curves)[:, :4].ravel()
-    ours, theirs = rng.choice(light, _PIXELS)[None], rng.choice(video, _PIXELS)
-    variances, axes = np.linalg.eigh(np.cov(theirs.T))
+    rng, plain_levels = np.random.default_rng(0), np.array(PLAIN.curves)[:, :4].ravel()
+    rendered, photographed = rng.choice(light, _PIXELS)[None], rng.choice(video, _PIXELS)
+    variances, axes = np.linalg.eigh(np.cov(photographed.T))
     directions = rng.standard_normal((3, _DIRECTIONS))
     directions /= np.linalg.norm(directions, axis=0)
     project = axes * (variances.max() / variances) ** 0.25 @ directions / np.sqrt(variances.sum())
@@ -125,24 +132,30 @@ def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     def quantiles(pixels: Floats) -> Floats:
         return np.asarray(np.sort(pixels @ project, axis=0).reshape(_QUANTILES, -1, _DIRECTIONS).mean(axis=1))
 
-    wanted = quantiles(theirs)
+    target = quantiles(photographed)
 
-    def residuals(free: Floats) -> Floats:
-        colours = _colours(free)
-        left = (quantiles(np.clip(processed(ours, *colours), 0, 1)[0]) - wanted) / np.sqrt(wanted.size)
-        unlike = np.array(colours.curves) - np.mean(colours.curves, axis=0)
-        return np.concatenate([left.ravel(), _NEUTRAL * unlike.ravel(), _KNOWN * (free - start)])
+    def residuals(parameters: Floats) -> Floats:
+        colours = _colours(parameters)
+        mismatch = (quantiles(np.clip(process_colours(rendered, *colours), 0, 1)[0]) - target) / np.sqrt(
+            target.size
+        )
+        channel_spread = np.array(colours.curves) - np.mean(colours.curves, axis=0)
+        return np.concatenate(
+            [mismatch.ravel(), _NEUTRAL * channel_spread.ravel(), _KNOWN * (parameters - start)]
+        )
 
-    start = np.append(np.ones(6), plain)
-    low, high = np.append([_LOW] * 6, plain - _CURVE), np.append([_HIGH] * 6, plain + _CURVE)
-    found = least_squares(residuals, start, bounds=(low, high), max_nfev=40, diff_step=3e-3)
-    return _colours(found.x), float(found.cost)
+    start = np.append(np.ones(6), plain_levels)
+    low, high = np.append([_LOW] * 6, plain_levels - _CURVE), np.append([_HIGH] * 6, plain_levels + _CURVE)
+    solution = least_squares(residuals, start, bounds=(low, high), max_nfev=40, diff_step=3e-3)
+    return _colours(solution.x), float(solution.cost)
 
 
-def _colours(free: Floats) -> ColourProcessing:
+def _colours(parameters: Floats) -> ColourProcessing:
     """Colours from 6 off-diagonal elements plus 1, and the first 4 levels of 3 curves, made to rise to 1."""
-    a, b, c, d, e, f = free[:6] - 1
+    a, b, c, d, e, f = parameters[:6] - 1
     matrix = np.array([[1 - a - b, a, b], [c, 1 - c - d, d], [e, f, 1 - e - f]])
-    levels = np.pad(np.clip(free[6:].reshape(3, 4), 0, 1), ((0, 0), (0, 1)), constant_values=1)
-    rows: list[Any] = [tuple(map(tuple, one.tolist())) for one in (matrix, np.maximum.accumulate(levels, 1))]
+    levels = np.pad(np.clip(parameters[6:].reshape(3, 4), 0, 1), ((0, 0), (0, 1)), constant_values=1)
+    rows: list[Any] = [
+        tuple(map(tuple, table.tolist())) for table in (matrix, np.maximum.accumulate(levels, 1))
+    ]
     return ColourProcessing(*rows)

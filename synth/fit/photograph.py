@@ -55,24 +55,24 @@ class Compression(NamedTuple):
         """A picture (H, W, 3) compressed alike at the file's resolution, and resampled back."""
         if not self.tables:
             return rgb
-        packed = io.BytesIO()
+        buffer = io.BytesIO()
         size = [round(side * self.finer) for side in rgb.shape[1::-1]]
-        large = cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
+        enlarged = cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
         sampling = _SAMPLING.index(self.chroma)
-        Image.fromarray(large).save(packed, "JPEG", qtables=self.tables, subsampling=sampling)
-        back = np.asarray(Image.open(packed).convert("RGB"))
-        return np.asarray(cv2.resize(back, rgb.shape[1::-1], interpolation=cv2.INTER_AREA), np.uint8)
+        Image.fromarray(enlarged).save(buffer, "JPEG", qtables=self.tables, subsampling=sampling)
+        decoded = np.asarray(Image.open(buffer).convert("RGB"))
+        return np.asarray(cv2.resize(decoded, rgb.shape[1::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def bitrate_mbps(self, rgb: Pixels) -> float | None:
         """The least bitrate tried, for 640 x 480, at which H.264 loses no more; None: invisible loss."""
-        lost = cv2.PSNR(rgb, self.apply(rgb))
-        if lost > _INVISIBLE_DB:
+        psnr_db = cv2.PSNR(rgb, self.apply(rgb))
+        if psnr_db > _INVISIBLE_DB:
             return None
         noise = np.random.default_rng(0).normal(0, 2, (5, *rgb.shape))
         video = np.clip(rgb + noise, 0, 255).astype(np.uint8)
         for rate in _BITRATES:
-            back = transmit(video, 25.0, rate * rgb[..., 0].size / (640 * 480), self.chroma)
-            if cv2.PSNR(video, back) >= lost:
+            decoded = transmit(video, 25.0, rate * rgb[..., 0].size / (640 * 480), self.chroma)
+            if cv2.PSNR(video, decoded) >= psnr_db:
                 break
         return rate
 
@@ -98,22 +98,25 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
     rgb = np.ascontiguousarray(np.asarray(checked_file.read_picture(path), np.uint8)[..., ::-1])
     if min(rgb.shape[:2]) < _SMALLEST_PX:
         raise UserError(f"{path}: is smaller than {_SMALLEST_PX} pixels; use a larger picture")
-    own, usual = width_mm / rgb.shape[1], RenderSection()
-    finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
-    painted = None if mask is None else np.asarray(checked_file.read_picture(mask, 0)) > 127
-    usable = find_cortex(rgb, own) if painted is None else painted
+    mm_per_px, render_section = width_mm / rgb.shape[1], RenderSection()
+    finer = max(1.0, sum(render_section.field_mm) / 2 / render_section.size[0] / mm_per_px)
+    painted_mask = None if mask is None else np.asarray(checked_file.read_picture(mask, 0)) > 127
+    usable = find_cortex(rgb, mm_per_px) if painted_mask is None else painted_mask
     if usable.shape != rgb.shape[:2]:
         raise UserError(f"{mask}: has another size than the photograph")
-    both = np.dstack([rgb, 255 * usable.astype(np.uint8)])
-    small = cv2.resize(both, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA)
-    packed = Compression.of_file(checked_file.read_bytes(path, checked_file.LARGEST_PICTURE), finer)
-    found = Photograph(np.ascontiguousarray(small[..., :3]), small[..., 3] > 252, own * finer, packed)
-    if found.cortex_mm2 < _LEAST_MM2:
+    rgba = np.dstack([rgb, 255 * usable.astype(np.uint8)])
+    small = cv2.resize(rgba, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA)
+    compression = Compression.of_file(checked_file.read_bytes(path, checked_file.LARGEST_PICTURE), finer)
+    photograph = Photograph(
+        np.ascontiguousarray(small[..., :3]), small[..., 3] > 252, mm_per_px * finer, compression
+    )
+    if photograph.cortex_mm2 < _LEAST_MM2:
         raise UserError(
-            f"{path}: {found.cortex_mm2:.0f} mm2 of cortex in a width of {width_mm:g} mm, {_LEAST_MM2:g} are "
-            "needed; mark the cortex with --mask, or correct the picture's width with --width-mm"
+            f"{path}: {photograph.cortex_mm2:.0f} mm2 of cortex in a width of {width_mm:g} mm, "
+            f"{_LEAST_MM2:g} are needed; mark the cortex with --mask, or correct the picture's "
+            "width with --width-mm"
         )
-    return found
+    return photograph
 
 
 def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
@@ -125,23 +128,27 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     coarser, without noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the
     photograph's.
     """
-    wet = find_highlights(rgb).astype(np.uint8)
-    tissue, clear = (usable & (cv2.dilate(wet, np.ones((2 * by + 1,) * 2)) == 0) for by in _GROWN_PX)
+    highlights = find_highlights(rgb).astype(np.uint8)
+    tissue, clear = (
+        usable & (cv2.dilate(highlights, np.ones((2 * radius + 1,) * 2)) == 0) for radius in _GROWN_PX
+    )
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     block = cv2.blur(np.abs(cv2.filter2D(grey, -1, _LAPLACIAN)), (_BLOCK, _BLOCK))
-    full = cv2.erode(tissue.astype(np.uint8), np.ones((_BLOCK, _BLOCK))) > 0
-    noise = np.sqrt(np.pi / 2) / 6 * np.quantile(block[full if full.any() else tissue], _SMOOTHEST)
+    interior = cv2.erode(tissue.astype(np.uint8), np.ones((_BLOCK, _BLOCK))) > 0
+    noise = np.sqrt(np.pi / 2) / 6 * np.quantile(block[interior if interior.any() else tissue], _SMOOTHEST)
     energy = []
     for fine, coarse in _BANDS_PX:
         band = cv2.GaussianBlur(grey, (0, 0), fine) - cv2.GaussianBlur(grey, (0, 0), coarse)
         # White noise of unit variance leaves this much in a difference of Gaussians.
-        left = (1 / fine**2 + 1 / coarse**2 - 4 / (fine**2 + coarse**2)) / (4 * np.pi)
-        energy.append(max(float(band[clear].var()) - left * noise**2, 0.01))
-    at, middle = np.argwhere(tissue), (np.array(tissue.shape) - 1) / 2
-    away = reach**2 * ((at - middle) ** 2).sum(axis=1) / (middle**2).sum()
+        noise_gain = (1 / fine**2 + 1 / coarse**2 - 4 / (fine**2 + coarse**2)) / (4 * np.pi)
+        energy.append(max(float(band[clear].var()) - noise_gain * noise**2, 0.01))
+    positions, middle = np.argwhere(tissue), (np.array(tissue.shape) - 1) / 2
+    radial = reach**2 * ((positions - middle) ** 2).sum(axis=1) / (middle**2).sum()
     red = rgb[tissue, 0] / np.median(rgb[tissue, 0])
     light = np.log(np.maximum(red**2.2, 0.5))
-    slopes = _fit_without_outliers(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
+    slopes = _fit_without_outliers(
+        np.column_stack([radial, np.ones(len(positions)), positions / len(positions)]), light
+    )
     sharpness = float(np.sqrt(energy[0] / energy[1]))
     return {"noise": float(noise), "sharpness": sharpness, "vignette": -float(slopes[0])}
 
@@ -149,11 +156,11 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
 def _fit_without_outliers(terms: Floats, values: Floats) -> Floats:
     """Least-squares coefficients (n,) of terms (N, n), without values (N,) that are off by `_OFF`: vessels
     and clefts, which lie elsewhere in every cortex."""
-    near = np.ones(len(values), bool)
+    inliers = np.ones(len(values), bool)
     for _ in range(_FITS):
-        slopes, *_ = np.linalg.lstsq(terms[near], values[near])
-        off = values - terms @ slopes
-        near = np.abs(off - np.median(off[near])) < _OFF
+        slopes, *_ = np.linalg.lstsq(terms[inliers], values[inliers])
+        residuals = values - terms @ slopes
+        inliers = np.abs(residuals - np.median(residuals[inliers])) < _OFF
     return np.asarray(slopes)
 
 
@@ -181,8 +188,8 @@ def find_cortex(rgb: Pixels, mm_per_px: float) -> Mask:
     scale = min(1.0, _OUTLINE_PX / max(rgb.shape))
     small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
     red, green, blue = np.moveaxis(small.astype(np.float32), 2, 0)
-    wide = (max(3, round(_VESSEL_MM / mm_per_px * scale)),) * 2
-    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), wide) > 0.9
+    kernel_px = (max(3, round(_VESSEL_MM / mm_per_px * scale)),) * 2
+    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), kernel_px) > 0.9
     steel = cv2.resize(segment(rgb, rgb).instrument, small.shape[1::-1]) > _STEEL
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in small.shape[:2]), indexing="ij")
     label = np.where(x**2 + y**2 < _MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -192,6 +199,6 @@ def find_cortex(rgb: Pixels, mm_per_px: float) -> Mask:
     cv2.setRNGSeed(1)  # for the initial colour clusters
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), label, None, *models, 6, cv2.GC_INIT_WITH_MASK)
-    inside = (label == cv2.GC_PR_FGD).astype(np.uint8)
-    found = cv2.erode(inside, np.ones((_INSET_PX, _INSET_PX)), borderValue=1)
-    return np.asarray(cv2.resize(found, rgb.shape[1::-1]) > 0)
+    foreground = (label == cv2.GC_PR_FGD).astype(np.uint8)
+    cortex = cv2.erode(foreground, np.ones((_INSET_PX, _INSET_PX)), borderValue=1)
+    return np.asarray(cv2.resize(cortex, rgb.shape[1::-1]) > 0)

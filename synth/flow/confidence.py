@@ -23,8 +23,8 @@ def of_deviation(deviation_px: Map) -> Map:
 
 def deviation(confidence: Map) -> Map:
     """Standard deviation [px] for a confidence, both (H, W), limited to 0.016..3.5 px."""
-    sure = np.clip(confidence, 0.02, 0.999)
-    return np.asarray(_HALF_PX * np.sqrt(1 / sure - 1), np.float32)
+    clipped_confidence = np.clip(confidence, 0.02, 0.999)
+    return np.asarray(_HALF_PX * np.sqrt(1 / clipped_confidence - 1), np.float32)
 
 
 def add_deviation(confidence: Map, deviation_px: float) -> Map:
@@ -43,5 +43,5 @@ def agreement(pictures: image.Level, warped: Map, visible: Map) -> Map:
     sums = np.stack([mask, first * warped, first * pictures.rest, second * warped])
     total, product, power, power_now = image.window(sums, _WINDOW)
     product, power, power_now = (part / np.maximum(total, 1e-4) for part in (product, power, power_now))
-    found = product / np.sqrt((power + np.float32(_NOISE)) * (power_now + np.float32(_NOISE)))
-    return np.asarray(mask * image.doubled(found.clip(0, 1)[None], mask.shape)[0])
+    correlation = product / np.sqrt((power + np.float32(_NOISE)) * (power_now + np.float32(_NOISE)))
+    return np.asarray(mask * image.double(correlation.clip(0, 1)[None], mask.shape)[0])

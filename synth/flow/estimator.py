@@ -54,8 +54,8 @@ class CheckedEstimator:
         with as_user_error(self._label):
             flow, confidence = self._estimator.flow(rest, now, rest_usable, now_usable, initial)
         size = rest.shape[:2]
-        sure = check_answer(self._label, "confidence", confidence, size, (0, 1))
-        return check_answer(self._label, "flow", flow, (*size, 2)), sure
+        checked_confidence = check_answer(self._label, "confidence", confidence, size, (0, 1))
+        return check_answer(self._label, "flow", flow, (*size, 2)), checked_confidence
 
 
 def create(backend: str | Estimator) -> Estimator:
@@ -65,7 +65,8 @@ def create(backend: str | Estimator) -> Estimator:
     """
     if not isinstance(backend, str):
         kind = type(backend)
-        ours = kind.__module__.startswith("synth.")
-        return backend if ours else CheckedEstimator(backend, f"flow.backend {kind.__qualname__}")
+        is_builtin = kind.__module__.startswith("synth.")
+        return backend if is_builtin else CheckedEstimator(backend, f"flow.backend {kind.__qualname__}")
     estimator: Estimator = ESTIMATORS.load(backend)
-    return estimator if backend in ESTIMATORS.own else CheckedEstimator(estimator, ESTIMATORS.label(backend))
+    is_builtin = backend in ESTIMATORS.builtin
+    return estimator if is_builtin else CheckedEstimator(estimator, ESTIMATORS.label(backend))

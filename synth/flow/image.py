@@ -38,7 +38,7 @@ class Level:
     now_usable: Map
 
 
-def ends(flow: Map) -> tuple[Map, Map]:
+def end_points(flow: Map) -> tuple[Map, Map]:
     """Columns and rows, (H, W) px each, to which a flow (H, W, 2) px leads."""
     x, y = (np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])
     return x + flow[..., 0], y[:, None] + flow[..., 1]
@@ -61,7 +61,7 @@ def box(planes: Map, radius: int) -> Map:
     return out
 
 
-def halved(planes: Map) -> Map:
+def halve(planes: Map) -> Map:
     """Mean of (C, H, W) over 2 x 2 pixels: (C, ceil(H/2), ceil(W/2)); over fewer at an odd border."""
     count, height, width = planes.shape
     out = np.empty((count, (height + 1) // 2, (width + 1) // 2), np.float32)
@@ -72,17 +72,17 @@ def halved(planes: Map) -> Map:
 def window(planes: Map, sigma: float) -> Map:
     """Approximate Gaussian blur at half the size, (C, H/2, W/2): two box filters."""
     radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # each box has the variance ((2r+1)^2 - 1)/12
-    return box(box(halved(planes), radius), radius)
+    return box(box(halve(planes), radius), radius)
 
 
-def doubled(planes: Map, shape: tuple[int, ...]) -> Map:
+def double(planes: Map, shape: tuple[int, ...]) -> Map:
     """Planes (C, h, w) at twice their size (bilinear), cropped to a height and a width."""
-    return np.stack([cv2.resize(one, None, fx=2, fy=2)[: shape[0], : shape[1]] for one in planes])
+    return np.stack([cv2.resize(plane, None, fx=2, fy=2)[: shape[0], : shape[1]] for plane in planes])
 
 
-def resized(planes: Map, shape: tuple[int, ...]) -> Map:
+def resize(planes: Map, shape: tuple[int, ...]) -> Map:
     """Planes (C, h, w) at another height and width (bilinear)."""
-    return np.stack([cv2.resize(one, (shape[1], shape[0])) for one in planes])
+    return np.stack([cv2.resize(plane, (shape[1], shape[0])) for plane in planes])
 
 
 def normalise(grey: Map, usable: Map) -> Map:
@@ -96,7 +96,7 @@ def normalise(grey: Map, usable: Map) -> Map:
     total, first, second = window(np.stack([usable, centred, (grey - np.float32(128)) * centred]), _WINDOW)
     mean, square = first / np.maximum(total, 1e-4), second / np.maximum(total, 1e-4)
     deviation = np.sqrt(np.maximum(square - mean**2, 0)) + np.float32(_FLOOR)
-    offset, scale = doubled(np.stack([mean + 128, 1 / deviation]), grey.shape)
+    offset, scale = double(np.stack([mean + 128, 1 / deviation]), grey.shape)
     return np.asarray((usable > 0) * (grey - offset) * scale)
 
 
@@ -108,9 +108,9 @@ def fill(field: Map, usable: Map) -> Map:
     known = field * usable
     if min(field.shape) <= 2:
         return np.asarray(known + (1 - usable) * (known.mean() / max(usable.mean(), np.float32(1e-6))))
-    total, weight = halved(np.stack([known, usable]))
+    total, weight = halve(np.stack([known, usable]))
     coarse = fill(total / np.maximum(weight, 1e-6), flags(weight > 0))
-    return np.asarray(known + (1 - usable) * resized(coarse[None], field.shape)[0])
+    return np.asarray(known + (1 - usable) * resize(coarse[None], field.shape)[0])
 
 
 def warp(now: Map, usable: Map, flow: Map) -> tuple[Map, Map]:

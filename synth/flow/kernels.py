@@ -21,16 +21,16 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> No
     picture = cv2.copyMakeBorder(now, *(_BORDER,) * 4, cv2.BORDER_REPLICATE)
     known = cv2.copyMakeBorder(usable, *(_BORDER,) * 4, cv2.BORDER_CONSTANT)
     width = now.shape[1]
-    weights, share = np.empty((2, 4, width), np.float32), np.empty((2, width), np.float32)
-    _sample(picture, known, flow, weights, share, np.empty((2, width), np.uint32), warped, visible)
+    weights, fraction = np.empty((2, 4, width), np.float32), np.empty((2, width), np.float32)
+    _sample(picture, known, flow, weights, fraction, np.empty((2, width), np.uint32), warped, visible)
 
 
 @argument_types("f4[:,::1], f4[:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,::1], u4[:,::1], f4[:,::1], f4[:,::1]")
 @vectorised
 def _sample(
-    picture: Map, known: Map, flow: Map, weights: Map, share: Map, whole: Ints, warped: Map, visible: Map
+    picture: Map, known: Map, flow: Map, weights: Map, fraction: Map, index: Ints, warped: Map, visible: Map
 ) -> None:
-    """Samples padded pictures; `weights` (2, 4, W), `share` and `whole` (2, W) are space for a row."""
+    """Samples padded pictures; `weights` (2, 4, W), `fraction` and `index` (2, W) are space for a row."""
     height, width = warped.shape
     a, border = _CUBIC, _BORDER
     last = (width + 1, height + 1)
@@ -39,16 +39,16 @@ def _sample(
         for c in range(2):
             for x in range(width):
                 # Positions are clamped to the border; the integer part is clamped again because NaN passes.
-                at = min(max(np.float32(y if c else x) + flow[c, y, x], -_TWO), np.float32(last[c]))
-                t = at - np.floor(at)
+                position = min(max(np.float32(y if c else x) + flow[c, y, x], -_TWO), np.float32(last[c]))
+                t = position - np.floor(position)
                 r = _ONE - t
                 weights[c, 0, x], weights[c, 3, x] = a * t * r * r, a * r * t * t
                 weights[c, 1, x] = ((a + _TWO) * t - (a + np.float32(3))) * t * t + _ONE
                 weights[c, 2, x] = ((a + _TWO) * r - (a + np.float32(3))) * r * r + _ONE
-                share[c, x], whole[c, x] = t, border + min(max(np.int32(np.floor(at)), -2), last[c])
+                fraction[c, x], index[c, x] = t, border + min(max(np.int32(np.floor(position)), -2), last[c])
         for x in range(width):
-            i, j = whole[0, x], whole[1, x]
-            total, fx, fy = _ZERO, share[0, x], share[1, x]
+            i, j = index[0, x], index[1, x]
+            total, fx, fy = _ZERO, fraction[0, x], fraction[1, x]
             for k in range(4):
                 row = j + k - 1
                 line = weights[0, 0, x] * picture[row, i - 1] + weights[0, 1, x] * picture[row, i]
@@ -56,9 +56,9 @@ def _sample(
                 total += weights[1, k, x] * line
             warped[y, x] = total
             first, second = known[j, i] + fx * (known[j, i + 1] - known[j, i]), known[j + 1, i]
-            some = first + fy * (second + fx * (known[j + 1, i + 1] - second) - first)
-            most = max(max(known[j, i], known[j, i + 1]), max(known[j + 1, i], known[j + 1, i + 1]))
-            visible[y, x] = most if some > _VISIBLE * most else _ZERO
+            interpolated = first + fy * (second + fx * (known[j + 1, i + 1] - second) - first)
+            largest = max(max(known[j, i], known[j, i + 1]), max(known[j + 1, i], known[j + 1, i + 1]))
+            visible[y, x] = largest if interpolated > _VISIBLE * largest else _ZERO
 
 
 def differentiate(field: Map, dx: Map, dy: Map) -> None:
@@ -73,19 +73,21 @@ def box_into(field: Map, side: int, out: Map) -> None:
     for plane, mean in zip(field, out, strict=True):
         cv2.sepFilter2D(plane, cv2.CV_32F, window, window, dst=mean, borderType=cv2.BORDER_CONSTANT)
     radius = side // 2
-    for whole in (out.swapaxes(1, 2), out):  # along columns, then along rows
-        size = whole.shape[2]
+    for planes in (out.swapaxes(1, 2), out):  # along columns, then along rows
+        size = planes.shape[2]
         for x in (*range(min(radius, size)), *range(max(size - radius, radius), size)):
             inside = min(x, radius) + 1 + min(size - 1 - x, radius)
-            whole[:, :, x] *= np.float32(side / inside)
+            planes[:, :, x] *= np.float32(side / inside)
 
 
 def halve_into(field: Map, out: Map) -> None:
-    """See `image.halved`: means of field (N, H, W) over 2 x 2 pixels, fewer at an odd border, into `out`."""
+    """See `image.halve`: means of field (N, H, W) over 2 x 2 pixels, fewer at an odd border, into `out`."""
     height, width = out.shape[1:]
-    spare = 2 * height - field.shape[1], 2 * width - field.shape[2]
+    margins = 2 * height - field.shape[1], 2 * width - field.shape[2]
     for plane, half in zip(field, out, strict=True):
-        even = (
-            cv2.copyMakeBorder(plane, 0, spare[0], 0, spare[1], cv2.BORDER_REPLICATE) if any(spare) else plane
+        extended = (
+            cv2.copyMakeBorder(plane, 0, margins[0], 0, margins[1], cv2.BORDER_REPLICATE)
+            if any(margins)
+            else plane
         )
-        cv2.resize(even, (width, height), dst=half, interpolation=cv2.INTER_AREA)
+        cv2.resize(extended, (width, height), dst=half, interpolation=cv2.INTER_AREA)

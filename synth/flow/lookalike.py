@@ -26,23 +26,23 @@ from synth.flow.segmentation import Segmentation, segment
 class Limits:
     """Chosen by hand on six videos by Cycles with thick veins, and on renders with instruments at rest."""
 
-    likely: float = 0.5  # probability of an instrument above which a region is examined
-    small: float = 0.0005  # share of the picture below which it isn't
-    around: float = 0.05  # of the picture's width: how far an object that appears disturbs the flow
-    least_px: float = 0.6  # motion and difference of motions below which a pixel tells nothing
-    told: float = 3.0  # change along a difference of motions from which a pixel tells [noise]
-    told_least: float = 0.15  # the same [local deviations]
-    enough: float = 0.002  # share of the picture that has to tell
-    better: float = 0.55  # mean change by the flow over that by another motion, below which the flow is right
-    unlike: float = 0.05  # share of pixels that the flow may leave unexplained: veins 0.01, instruments 0.1
-    apart: float = 0.25  # median difference of the flow from that around, over the latter: 0.15 and 0.6
-    plain: float = 0.02  # `unlike` of a part that moves as all around it
-    near: float = 0.1  # its `apart`
-    farthest: float = 2.0  # limit of a change [local deviations]: pixels that are hidden count no more
+    min_probability: float = 0.5  # probability of an instrument above which a region is examined
+    min_area: float = 0.0005  # share of the picture below which it isn't
+    margin: float = 0.05  # of the picture's width: how far an object that appears disturbs the flow
+    min_motion_px: float = 0.6  # motion and difference of motions below which a pixel tells nothing
+    min_snr: float = 3.0  # change along a difference of motions from which a pixel tells [noise]
+    min_contrast: float = 0.15  # the same [local deviations]
+    min_evidence: float = 0.002  # share of the picture that has to tell
+    max_ratio: float = 0.55  # mean change by the flow over that by another motion, if the flow is right
+    max_unexplained: float = 0.05  # share that the flow leaves unexplained: veins 0.01, instruments 0.1
+    max_difference: float = 0.25  # median difference of the flow from that around, over it: 0.15 and 0.6
+    low_unexplained: float = 0.02  # `max_unexplained` of a part that moves as all around it
+    low_difference: float = 0.1  # its `max_difference`
+    max_change: float = 2.0  # limit of a change [local deviations]: pixels that are hidden count no more
     bins: int = 16  # of each channel of colours
-    alike: float = 0.15  # share of the mean density of proven colours from which a colour is proven too
-    shared: float = 0.7  # share of a region in proven colours from which it is tissue, if it tells nothing
-    changed: float = 10.0  # grey levels from which a pixel of a frame differs from the aligned rest frame
+    min_density: float = 0.15  # share of the mean density of proven colours from which a colour is proven too
+    min_colour_share: float = 0.7  # of a region in proven colours: above it is tissue, if it tells nothing
+    min_grey_change: float = 10.0  # grey levels from which a pixel differs from the aligned rest frame
     rim_px: int = 2  # half the width of differences that are rims of vessels
 
 
@@ -62,21 +62,21 @@ class LookalikeSearch:
     def __init__(self, rest: Pixels, tissue: Mask) -> None:
         """Starts with the rest frame (H, W, 3) uint8 and where tissue may be (H, W)."""
         self._rest, at_rest = rest, segment(rest, rest)
-        self._likely, self._shines = at_rest.instrument > Limits.likely, at_rest.shines
-        count, label = cv2.connectedComponents((self._likely & tissue).astype(np.uint8))
+        self._suspicious, self._glare = at_rest.instrument > Limits.min_probability, at_rest.glare
+        count, label = cv2.connectedComponents((self._suspicious & tissue).astype(np.uint8))
         sizes = np.bincount(label.ravel(), minlength=count)
-        self.regions = [label == k for k in range(1, count) if sizes[k] > Limits.small * label.size]
+        self.regions = [label == k for k in range(1, count) if sizes[k] > Limits.min_area * label.size]
         """(H, W) each, that look like instruments; without any there is nothing to search."""
         self._votes = Votes(*np.zeros((2, len(self.regions))))
-        self._moved = np.zeros(tissue.shape, bool)
+        self._moving = np.zeros(tissue.shape, bool)
 
     def add(self, frame: Pixels) -> None:
         """Adds what a later frame (H, W, 3) says."""
-        judged = _Judge(self._rest, frame, self._likely, self._shines)
-        self._moved |= judged.moved
+        judge = _Judge(self._rest, frame, self._suspicious, self._glare)
+        self._moving |= judge.moving
         for k, region in enumerate(self.regions):
-            told, is_tissue = judged.of(region)
-            (self._votes.good if is_tissue else self._votes.bad)[k] += told
+            share, is_tissue = judge.judge_region(region)
+            (self._votes.good if is_tissue else self._votes.bad)[k] += share
 
     def find(self) -> Mask:
         """Tissue (H, W) of the rest frame that looks like instruments.
@@ -84,18 +84,18 @@ class LookalikeSearch:
         A region that doesn't move is told by its colours, if another one with them is tissue. Of a region
         only these colours are taken: an instrument may lie on it.
         """
-        votes, chosen = self._votes, np.zeros(self._likely.shape, bool)
+        votes, tissue = self._votes, np.zeros(self._suspicious.shape, bool)
         is_tissue = votes.good > votes.bad
         for k in np.flatnonzero(is_tissue):
-            chosen |= self.regions[k]
-        proven = self._moved & chosen
+            tissue |= self.regions[k]
+        proven = self._moving & tissue
         if not proven.any():
             return proven
-        alike = _of_colours(self._rest, proven)
+        similar = _match_colours(self._rest, proven)
         for k in np.flatnonzero(~is_tissue & (votes.bad == 0)):
-            if alike[self.regions[k]].mean() > Limits.shared:
-                chosen |= self.regions[k]
-        return np.asarray(chosen & alike)
+            if similar[self.regions[k]].mean() > Limits.min_colour_share:
+                tissue |= self.regions[k]
+        return np.asarray(tissue & similar)
 
 
 def find_lookalikes(rest: Pixels, frames: Iterable[Pixels], tissue: Mask) -> Mask:
@@ -114,136 +114,152 @@ class Lookalikes:
         """`rest`: (H, W, 3) uint8; `tissue`: (H, W), see `find_lookalikes`."""
         self._rest, self._tissue = rest, cv2.dilate(tissue.astype(np.uint8), _disc(3))
 
-    def remove(self, found: Segmentation, frame: Pixels) -> Segmentation:
+    def remove(self, segmentation: Segmentation, frame: Pixels) -> Segmentation:
         """The classes of a frame (H, W, 3) without instruments where it shows that tissue as at rest."""
-        if not (found.instrument > Limits.likely).any():
-            return found
-        back = cv2.blur(
+        if not (segmentation.instrument > Limits.min_probability).any():
+            return segmentation
+        backward_flow = cv2.blur(
             np.dstack([cv2.medianBlur(plane, 5) for plane in cv2.split(_flow(frame, self._rest))]), (9, 9)
         )
-        columns, rows = image.ends(back)
-        there = cv2.remap(self._tissue, columns, rows, cv2.INTER_NEAREST) > 0
+        columns, rows = image.end_points(backward_flow)
+        at_tissue = cv2.remap(self._tissue, columns, rows, cv2.INTER_NEAREST) > 0
         before = cv2.remap(self._rest, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         now, before = (cv2.blur(picture, (3, 3)).astype(np.float32) for picture in (frame, before))
-        unlike = (np.abs(now - before).mean(axis=-1) > Limits.changed).astype(np.uint8)
+        changed = (np.abs(now - before).mean(axis=-1) > Limits.min_grey_change).astype(np.uint8)
         disc = _disc(Limits.rim_px)
-        unlike = cv2.dilate(cv2.morphologyEx(unlike, cv2.MORPH_OPEN, disc), disc)
-        kept = np.where(there & (unlike == 0), 0, found.instrument)
-        return replace(found, instrument=np.asarray(kept, np.float32))
+        changed = cv2.dilate(cv2.morphologyEx(changed, cv2.MORPH_OPEN, disc), disc)
+        instrument = np.where(at_tissue & (changed == 0), 0, segmentation.instrument)
+        return replace(segmentation, instrument=np.asarray(instrument, np.float32))
 
 
 class _Judge:
     """One frame, compared with the rest frame (H, W, 3)."""
 
-    def __init__(self, rest: Pixels, frame: Pixels, likely: Mask, shines: Mask) -> None:
-        found, size = segment(rest, frame), likely.shape
+    def __init__(self, rest: Pixels, frame: Pixels, suspicious: Mask, glare: Mask) -> None:
+        segmentation, size = segment(rest, frame), suspicious.shape
         # What appeared since rest hides tissue, and the flow next to it isn't the tissue's.
-        appeared = ((found.instrument > Limits.likely) & ~likely).astype(np.uint8)
+        appeared = ((segmentation.instrument > Limits.min_probability) & ~suspicious).astype(np.uint8)
         appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-        self._free = cv2.dilate(appeared, _square(round(Limits.around * size[1]))) == 0
+        self._free = cv2.dilate(appeared, _square(round(Limits.margin * size[1]))) == 0
         self._flow = _flow(rest, frame)
-        everywhere = np.ones(size, np.float32)
+        full_mask = np.ones(size, np.float32)
         self._before, self._after = (
-            cv2.GaussianBlur(image.normalise(image.luminance(picture), everywhere), (0, 0), 0.8)
+            cv2.GaussianBlur(image.normalise(image.luminance(picture), full_mask), (0, 0), 0.8)
             for picture in (rest, frame)
         )
-        slopes = [cv2.Sobel(self._before, cv2.CV_32F, *way, ksize=3, scale=1 / 8) for way in ((1, 0), (0, 1))]
+        slopes = [
+            cv2.Sobel(self._before, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
+        ]
         self._slope = np.stack(slopes, axis=-1)
-        outside = image.flags(~_wider(likely) & self._free & ~(found.shines | shines))
-        around = np.dstack(
+        outside = image.flags(~_widen(suspicious) & self._free & ~(segmentation.glare | glare))
+        surrounding_flow = np.dstack(
             [image.fill(np.ascontiguousarray(plane), outside) for plane in cv2.split(self._flow)]
         )
-        self._size = np.linalg.norm(around, axis=-1)
-        self._apart = np.linalg.norm(self._flow - around, axis=-1)
-        still = np.zeros_like(self._flow)
-        self._by_flow, self._by_none = self._change(self._flow), self._change(still)
-        self._noise = 1.4826 * float(np.median(self._by_flow))
-        self._told = self._tells(still)
-        near = self._apart < Limits.apart * self._size
-        self.moved = self._told & near & (self._by_flow < Limits.better * self._by_none)
+        self._magnitude = np.linalg.norm(surrounding_flow, axis=-1)
+        self._difference = np.linalg.norm(self._flow - surrounding_flow, axis=-1)
+        no_motion = np.zeros_like(self._flow)
+        self._flow_change = self._measure_change(self._flow)
+        self._still_change = self._measure_change(no_motion)
+        self._noise = 1.4826 * float(np.median(self._flow_change))
+        self._evidence = self._find_evidence(no_motion)
+        coherent = self._difference < Limits.max_difference * self._magnitude
+        self.moving = self._evidence & coherent & (self._flow_change < Limits.max_ratio * self._still_change)
         """(H, W) what moves as tissue."""
         self._border = np.ones(size, bool)
         self._border[3:-3, 3:-3] = False
 
-    def of(self, region: Mask) -> tuple[float, bool]:
+    def judge_region(self, region: Mask) -> tuple[float, bool]:
         """Share of the picture that tells how a region (H, W) moves, 0 if too little, and whether it moves as
         tissue."""
-        wide, seen = _wider(region), region & self._free
-        told = wide & self._told
-        moving, share = seen & (self._size > Limits.least_px), float(told.mean())
-        if share < Limits.enough:
+        widened, visible = _widen(region), region & self._free
+        evidence = widened & self._evidence
+        moving, share = visible & (self._magnitude > Limits.min_motion_px), float(evidence.mean())
+        if share < Limits.min_evidence:
             return 0.0, False
         if not moving.any():
             return share, False
-        apart = float(np.median(self._apart[moving] / self._size[moving]))
-        unlike = float(np.mean(self._by_flow[seen] >= max(4 * self._noise, 0.6)))
-        is_better = _ratio(self._by_flow, self._by_none, told) < Limits.better
-        if not is_better or unlike >= Limits.unlike or apart >= Limits.apart:
+        difference = float(np.median(self._difference[moving] / self._magnitude[moving]))
+        unexplained = float(np.mean(self._flow_change[visible] >= max(4 * self._noise, 0.6)))
+        is_better = _compare_changes(self._flow_change, self._still_change, evidence) < Limits.max_ratio
+        if not is_better or unexplained >= Limits.max_unexplained or difference >= Limits.max_difference:
             return share, False
         # A part that moves as all around it is tissue, unless a shaft may lead from it out of the picture.
-        if apart < Limits.near and unlike < Limits.plain and not (region & self._border).any():
+        if (
+            difference < Limits.low_difference
+            and unexplained < Limits.low_unexplained
+            and not (region & self._border).any()
+        ):
             return share, True
-        rigid = _rigid(self._before, self._after, wide, self._flow)
-        told = wide & self._tells(rigid)
-        by_rigid = self._change(rigid)
-        is_told = told.mean() > Limits.enough
-        return share * is_told, _ratio(self._by_flow, by_rigid, told) < Limits.better
+        rigid = _fit_rigid(self._before, self._after, widened, self._flow)
+        evidence = widened & self._find_evidence(rigid)
+        rigid_change = self._measure_change(rigid)
+        is_evident = evidence.mean() > Limits.min_evidence
+        is_better = _compare_changes(self._flow_change, rigid_change, evidence) < Limits.max_ratio
+        return share * is_evident, is_better
 
-    def _change(self, motion: Map) -> Map:
+    def _measure_change(self, motion: Map) -> Map:
         """Change (H, W), limited, that a motion (H, W, 2) px leaves [local deviations]."""
-        ends = image.ends(motion)
-        warped = cv2.remap(self._after, *ends, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(np.minimum(np.abs(warped - self._before), Limits.farthest))
+        positions = image.end_points(motion)
+        warped = cv2.remap(self._after, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(np.minimum(np.abs(warped - self._before), Limits.max_change))
 
-    def _tells(self, motion: Map) -> Mask:
+    def _find_evidence(self, motion: Map) -> Mask:
         """Where (H, W) the picture tells the flow from another motion (H, W, 2) px."""
-        off = self._flow - motion
-        change = np.abs((self._slope * off).sum(axis=-1))
-        is_seen = change > max(Limits.told * self._noise, Limits.told_least)
-        return np.asarray(is_seen & (np.linalg.norm(off, axis=-1) > Limits.least_px) & self._free)
+        difference = self._flow - motion
+        change = np.abs((self._slope * difference).sum(axis=-1))
+        is_visible = change > max(Limits.min_snr * self._noise, Limits.min_contrast)
+        return np.asarray(
+            is_visible & (np.linalg.norm(difference, axis=-1) > Limits.min_motion_px) & self._free
+        )
 
 
 def _flow(rest: Pixels, frame: Pixels) -> Map:
     """Flow (H, W, 2) px between two pictures without masks, coarse but fast."""
-    everywhere = np.ones(rest.shape[:2], bool)
-    return Dis().flow(rest, frame, everywhere, everywhere)[0]
+    full_mask = np.ones(rest.shape[:2], bool)
+    return Dis().flow(rest, frame, full_mask, full_mask)[0]
 
 
-def _rigid(before: Map, after: Map, region: Mask, flow: Map) -> Map:
+def _fit_rigid(before: Map, after: Map, region: Mask, flow: Map) -> Map:
     """The Euclidean motion (H, W, 2) px of a region (H, W) that fits best, from several starts."""
-    inner, size = flow[region], np.linalg.norm(flow[region], axis=-1)
-    starts = [np.zeros(2), np.median(inner, axis=0), inner[size >= np.quantile(size, 0.95)].mean(axis=0)]
-    best, most = np.eye(2, 3, dtype=np.float32), -2.0
+    region_flow, magnitude = flow[region], np.linalg.norm(flow[region], axis=-1)
+    starts = [
+        np.zeros(2),
+        np.median(region_flow, axis=0),
+        region_flow[magnitude >= np.quantile(magnitude, 0.95)].mean(axis=0),
+    ]
+    best, best_score = np.eye(2, 3, dtype=np.float32), -2.0
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-4)
     for start in starts:
-        turn = np.column_stack([np.eye(2), start]).astype(np.float32)
+        matrix = np.column_stack([np.eye(2), start]).astype(np.float32)
         mask = region.astype(np.uint8)
         try:
-            score, turn = cv2.findTransformECC(before, after, turn, cv2.MOTION_EUCLIDEAN, criteria, mask, 5)
+            score, matrix = cv2.findTransformECC(
+                before, after, matrix, cv2.MOTION_EUCLIDEAN, criteria, mask, 5
+            )
         except cv2.error:  # it doesn't converge from this start
             continue
-        if score > most:
-            best, most = turn, score
-    places = np.stack(np.meshgrid(*map(np.arange, before.shape[::-1])), axis=-1).astype(np.float32)
-    return np.asarray(places @ best[:, :2].T + best[:, 2] - places, np.float32)
+        if score > best_score:
+            best, best_score = matrix, score
+    pixels = np.stack(np.meshgrid(*map(np.arange, before.shape[::-1])), axis=-1).astype(np.float32)
+    return np.asarray(pixels @ best[:, :2].T + best[:, 2] - pixels, np.float32)
 
 
-def _of_colours(rgb: Pixels, proven: Mask) -> Mask:
+def _match_colours(rgb: Pixels, proven: Mask) -> Mask:
     """Where a picture (H, W, 3) has the colours of proven tissue (H, W), without specks and holes."""
     lab = cv2.cvtColor(cv2.blur(rgb, (3, 3)), cv2.COLOR_RGB2Lab)
-    bins, every = [Limits.bins] * 3, [0, 256] * 3
-    counts = cv2.calcHist([lab], [0, 1, 2], proven.astype(np.uint8), bins, every)
+    bins, ranges = [Limits.bins] * 3, [0, 256] * 3
+    counts = cv2.calcHist([lab], [0, 1, 2], proven.astype(np.uint8), bins, ranges)
     density = gaussian_filter(counts, 0.7)[tuple((lab // (256 // Limits.bins)).transpose(2, 0, 1))]
-    alike = (density > Limits.alike * density[proven].mean()).astype(np.uint8)
-    closed = cv2.morphologyEx(alike, cv2.MORPH_CLOSE, _disc(3))
+    similar = (density > Limits.min_density * density[proven].mean()).astype(np.uint8)
+    closed = cv2.morphologyEx(similar, cv2.MORPH_CLOSE, _disc(3))
     return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, _disc(3)) > 0)
 
 
-def _ratio(these: Map, those: Map, where: Mask) -> float:
-    return float(these[where].sum() / max(float(those[where].sum()), 1e-6))
+def _compare_changes(changes: Map, other_changes: Map, mask: Mask) -> float:
+    return float(changes[mask].sum() / max(float(other_changes[mask].sum()), 1e-6))
 
 
-def _wider(mask: Mask) -> Mask:
+def _widen(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), _square(2)) > 0)
 
 

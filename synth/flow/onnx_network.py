@@ -37,5 +37,5 @@ def open_network(data: bytes, label: str, threads: int = 1) -> onnxruntime.Infer
 
 def run(path: Path, planes: Map) -> Map:
     """Output (C', H', W') of the network of a file for one input (C, H, W) float32."""
-    (found,) = load(path).run(None, {"planes": planes[None]})
-    return np.asarray(found[0], np.float32)
+    (output,) = load(path).run(None, {"planes": planes[None]})
+    return np.asarray(output[0], np.float32)

@@ -52,11 +52,11 @@ def _solve(
     start = np.zeros((height, width, 2), np.float32) if initial is None else initial.astype(np.float32)
     if min(height, width) < _SMALLEST:
         # Mirrored to the smallest size that has a pyramid; the result is cropped.
-        spare = ((0, max(0, _SMALLEST - height)), (0, max(0, _SMALLEST - width)))
-        before, after = np.pad(before, spare, "symmetric"), np.pad(after, spare, "symmetric")
-        start = np.pad(start, (*spare, (0, 0)), "edge")
-    found = solver.calc(before, after, start)[:height, :width]
-    flow = np.where(np.isfinite(found), found, 0).astype(np.float32)
+        margins = ((0, max(0, _SMALLEST - height)), (0, max(0, _SMALLEST - width)))
+        before, after = np.pad(before, margins, "symmetric"), np.pad(after, margins, "symmetric")
+        start = np.pad(start, (*margins, (0, 0)), "edge")
+    solution = solver.calc(before, after, start)[:height, :width]
+    flow = np.where(np.isfinite(solution), solution, 0).astype(np.float32)
     return flow, _confidence(flow, before[:height, :width], after[:height, :width], rest_usable, now_usable)
 
 
@@ -69,9 +69,9 @@ def _prepare(picture: Pixels, usable: Mask) -> Pixels:
 
 def _confidence(flow: Map, before: Pixels, after: Pixels, rest_usable: Mask, now_usable: Mask) -> Map:
     """(H, W) in 0..1: agreement of the aligned pictures; 0 where a point is masked in either."""
-    at = *image.ends(flow), cv2.INTER_LINEAR
-    visible = cv2.remap(now_usable.astype(np.float32), *at, borderValue=0) * rest_usable
-    aligned = cv2.remap(after.astype(np.float32), *at, borderMode=cv2.BORDER_REPLICATE)
+    sampling = *image.end_points(flow), cv2.INTER_LINEAR
+    visible = cv2.remap(now_usable.astype(np.float32), *sampling, borderValue=0) * rest_usable
+    aligned = cv2.remap(after.astype(np.float32), *sampling, borderMode=cv2.BORDER_REPLICATE)
     difference = cv2.GaussianBlur(((aligned - before) * visible / image.GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
     share = cv2.GaussianBlur(visible, (0, 0), 2.0)
     residual = difference / np.maximum(share, 1e-3)

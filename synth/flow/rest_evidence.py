@@ -33,7 +33,7 @@ class Limits:
     changed: float = 6.4  # grey levels over the picture's median change from which it has changed
     same: float = 4.0  # the same, below which it has not
     texture: float = 6.0  # standard deviation [grey levels] in a window of the rest frame that tells so
-    likely: float = 0.5  # probability of an instrument at rest from which it may lie still
+    min_instrument: float = 0.5  # probability of an instrument at rest from which it may lie still
     known: float = 0.004  # probability from 0 and from 1 within which odds tell nothing
     across_px: int = 5  # side of the window of the mean change, of the flow's median and mean
     around_px: int = 7  # side of the window of the texture
@@ -48,26 +48,28 @@ class RestEvidence:
         """Starts with the rest frame (H, W, 3) uint8 and its classes."""
         self._rest, self._instrument = _shrink(rest), _shrink(at_rest.instrument)
 
-    def weigh(self, found: Segmentation, frame: Pixels) -> Segmentation:
+    def weigh(self, segmentation: Segmentation, frame: Pixels) -> Segmentation:
         """The classes of a later frame (H, W, 3) uint8, with other odds of instruments."""
         small = _shrink(frame)
         rest, before = align(small, self._rest, self._instrument)
-        changed, same = compare(small, rest)
-        odds = logit(np.clip(_shrink(found.instrument), Limits.known, 1 - Limits.known))
-        told = np.where(changed, 1, 0) - np.where(same & (before < Limits.likely), 1, 0)
-        odds = (odds + np.log(Limits.factor) * told).astype(np.float32)
+        changed, unchanged = compare(small, rest)
+        odds = logit(np.clip(_shrink(segmentation.instrument), Limits.known, 1 - Limits.known))
+        evidence = np.where(changed, 1, 0) - np.where(unchanged & (before < Limits.min_instrument), 1, 0)
+        odds = (odds + np.log(Limits.factor) * evidence).astype(np.float32)
         odds = _cv2.ximgproc.fastGlobalSmootherFilter(small, odds, Limits.smooth, Limits.edge)
-        return replace(found, instrument=expit(cv2.resize(odds, frame.shape[1::-1])))
+        return replace(segmentation, instrument=expit(cv2.resize(odds, frame.shape[1::-1])))
 
 
 def align(frame: Pixels, rest: Pixels, instrument: Map) -> tuple[Pixels, Map]:
     """The rest frame (h, w, 3) uint8 and the probability of instruments there (h, w) at the pixels of a frame
     of its size, by a coarse flow (T. Kroeger et al., ECCV 2016)."""
     solver = _cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    back = solver.calc(_contrast(frame), _contrast(rest), np.zeros((*rest.shape[:2], 2), np.float32))
+    backward_flow = solver.calc(_contrast(frame), _contrast(rest), np.zeros((*rest.shape[:2], 2), np.float32))
     side = Limits.across_px
-    smooth = cv2.blur(np.dstack([cv2.medianBlur(plane, side) for plane in cv2.split(back)]), (side, side))
-    columns, rows = image.ends(smooth)
+    smooth = cv2.blur(
+        np.dstack([cv2.medianBlur(plane, side) for plane in cv2.split(backward_flow)]), (side, side)
+    )
+    columns, rows = image.end_points(smooth)
     mode = cv2.INTER_LINEAR
     return (
         np.asarray(cv2.remap(rest, columns, rows, mode, borderMode=cv2.BORDER_REPLICATE), np.uint8),

@@ -17,12 +17,12 @@ from synth.flow.segmentation import with_highlights
 class Tracking:
     """When a frame is solved again or counts as lost; chosen by hand where no source is given."""
 
-    low: float = 0.5  # mean confidence over visible tissue below which a frame is solved again from zero
-    drop: float = 0.85  # the same relative to the last trusted frame
-    matched: float = 0.1  # share of the visible tissue above `LOW_CONFIDENCE`; a frame with less is lost
-    free: float = 0.02  # unmasked share of the tissue; a frame with less is lost
-    wider: float = 0.2  # gain in confidence for which surroundings are used; they cost 10% error (design.md)
-    tries: int = 3  # frames in which surroundings are tried, to limit the time
+    min_confidence: float = 0.5  # mean over visible tissue below which a frame is solved again from zero
+    min_ratio: float = 0.85  # the same relative to the last trusted frame
+    min_matched: float = 0.1  # share of the visible tissue above `LOW_CONFIDENCE`; a frame with less is lost
+    min_visible: float = 0.02  # unmasked share of the tissue; a frame with less is lost
+    min_gain: float = 0.2  # in confidence, for which surroundings are used; they cost 10% error (design.md)
+    max_tries: int = 3  # frames in which surroundings are tried, to limit the time
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Tracker:
         self.last: Solution | None = None  # of the last frame
         self.initial: Map | None = None  # (H, W, 2) px from which the next frame starts; None: zero
         self._level = 1.0  # mean confidence of the last trusted frame
-        self._around, self._tries = ~tissue & ~rest_blocked, 0
+        self._surroundings, self._tries = ~tissue & ~rest_blocked, 0
         self.widened = False  # whether the surroundings are tracked together with the tissue
 
     def step(self, frame: Pixels, blocked: Mask) -> tuple[Map, Map]:
@@ -77,53 +77,55 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
-        found = self.solve(frame, blocked, self.initial)
-        if self.needs_retry(found):
+        solution = self.solve(frame, blocked, self.initial)
+        if self.needs_retry(solution):
             if self.initial is not None:
-                again = self.solve(frame, blocked, None)
-                if again.level > found.level:
-                    found, self.resets = again, self.resets + 1
-            found = self._wider(frame, blocked, found)
-        return self.accept(found)
+                retry = self.solve(frame, blocked, None)
+                if retry.level > solution.level:
+                    solution, self.resets = retry, self.resets + 1
+            solution = self._try_surroundings(frame, blocked, solution)
+        return self.accept(solution)
 
-    def _wider(self, frame: Pixels, blocked: Mask, found: Solution) -> Solution:
+    def _try_surroundings(self, frame: Pixels, blocked: Mask, solution: Solution) -> Solution:
         """Includes the surroundings, here and in all later frames, if confidence in the tissue rises enough.
 
         Still surroundings stabilise the flow of tissue with little texture; otherwise they bias its rim.
         """
-        if self.widened or self._tries >= Tracking.tries:
-            return found
+        if self.widened or self._tries >= Tracking.max_tries:
+            return solution
         self.widened, self._tries = True, self._tries + 1
-        wider = self.solve(frame, blocked, None)
-        self.widened = wider.level > found.level + Tracking.wider
-        return wider if self.widened else found
+        wide_solution = self.solve(frame, blocked, None)
+        self.widened = wide_solution.level > solution.level + Tracking.min_gain
+        return wide_solution if self.widened else solution
 
     def solve(self, frame: Pixels, blocked: Mask, initial: Map | None) -> Solution:
         """Solves a frame from a flow `initial` (None: zero) without changing the state; see `step`."""
-        domain = self.usable | self._around if self.widened else self.usable
+        domain = self.usable | self._surroundings if self.widened else self.usable
         flow, confidence = self.estimator.flow(self.rest, frame, domain, ~blocked, initial)
         confidence = confidence * self.tissue
         visible = self.usable & ~blocked
-        inside = confidence[visible] if visible.any() else np.zeros(1, np.float32)
+        visible_confidence = confidence[visible] if visible.any() else np.zeros(1, np.float32)
         return Solution(
             flow,
             confidence,
-            level=float(inside.mean(dtype=np.float64)),
-            is_matched=float(np.mean(inside >= LOW_CONFIDENCE)) >= Tracking.matched,
-            is_visible=float(visible.sum() / max(1, self.tissue.sum())) >= Tracking.free,
+            level=float(visible_confidence.mean(dtype=np.float64)),
+            is_matched=float(np.mean(visible_confidence >= LOW_CONFIDENCE)) >= Tracking.min_matched,
+            is_visible=float(visible.sum() / max(1, self.tissue.sum())) >= Tracking.min_visible,
         )
 
-    def needs_retry(self, found: Solution) -> bool:
+    def needs_retry(self, solution: Solution) -> bool:
         """Whether the confidence of a flow is low, alone or relative to the last trusted frame."""
-        return found.level < max(Tracking.low, Tracking.drop * self._level)
+        return solution.level < max(Tracking.min_confidence, Tracking.min_ratio * self._level)
 
-    def accept(self, found: Solution) -> tuple[Map, Map]:
+    def accept(self, solution: Solution) -> tuple[Map, Map]:
         """Makes a solution that of the frame; the next frame starts from it if it is trusted."""
-        self.last, self.trusted = found, found.is_visible and found.is_matched
+        self.last, self.trusted = solution, solution.is_visible and solution.is_matched
         if self.trusted:
-            self.initial, self._level = found.flow, found.level
-        sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * LOW_CONFIDENCE)
-        return found.flow * self.tissue[..., None], sure
+            self.initial, self._level = solution.flow, solution.level
+        confidence = (
+            solution.confidence if self.trusted else np.minimum(solution.confidence, 0.5 * LOW_CONFIDENCE)
+        )
+        return solution.flow * self.tissue[..., None], confidence
 
 
 @checked
@@ -142,9 +144,9 @@ def recover_flow(frames: Pixels, tool: Mask, tissue: Mask, backend: str | Estima
     is_video = isinstance(frames, np.ndarray) and frames.dtype == np.uint8 and frames.shape[3:] == (3,)
     if not is_video or not frames.size:
         raise UserError("frames: expected a non-empty array (T, H, W, 3) of uint8")
-    for what, given, shape in (("tool", tool, frames.shape[:3]), ("tissue", tissue, frames.shape[1:3])):
-        if np.shape(given) != shape or np.asarray(given).dtype != bool:
-            raise UserError(f"{what}: expected an array {shape} of bool, got {np.shape(given)}")
+    for name, mask, shape in (("tool", tool, frames.shape[:3]), ("tissue", tissue, frames.shape[1:3])):
+        if np.shape(mask) != shape or np.asarray(mask).dtype != bool:
+            raise UserError(f"{name}: expected an array {shape} of bool, got {np.shape(mask)}")
     return track(backend, frames, with_highlights(frames, tool), tissue)
 
 

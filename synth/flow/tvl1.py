@@ -90,17 +90,17 @@ class Tvl1:
         start = None if initial is None else np.ascontiguousarray(np.moveaxis(initial, -1, 0), np.float32)
         pictures = image.luminance(rest), image.luminance(now)
         usable = image.flags(rest_usable), image.flags(now_usable)
-        found, sure, (before, after, visible) = self.uncorrected(*pictures, *usable, start)
-        flow = np.moveaxis(found, 0, -1)
+        planes, agreement, (before, after, visible) = self.estimate_uncorrected(*pictures, *usable, start)
+        flow = np.moveaxis(planes, 0, -1)
         if not self.corrected:
-            return flow, sure
-        described = correction.describe(rest, now, rest_usable, (before, after), visible, flow, sure)
-        near = correction.nearness(rest_usable, now_usable)
-        flow, deviation = correction.correct(described, flow, near)
+            return flow, agreement
+        features = correction.describe(rest, now, rest_usable, (before, after), visible, flow, agreement)
+        proximity = correction.nearness(rest_usable, now_usable)
+        flow, deviation = correction.correct(features, flow, proximity)
         # The network was not trained where pictures disagree, as under an unmasked instrument.
-        return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
+        return flow, np.minimum(agreement / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
-    def uncorrected(
+    def estimate_uncorrected(
         self, rest: Map, now: Map, rest_usable: Map, now_usable: Map, initial: Map | None
     ) -> tuple[Map, Map, tuple[Map, Map, Map]]:
         """Uncorrected flow (2, H, W) px of greys and masks (H, W) float32, and of an initial flow.
@@ -111,15 +111,15 @@ class Tvl1:
         last = self._rest
         if last is None or not (np.array_equal(rest, last[0]) and np.array_equal(rest_usable, last[1])):
             self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
-        both = zip(last[2], pyramid(now, now_usable, s), strict=True)
-        levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
+        pairs = zip(last[2], pyramid(now, now_usable, s), strict=True)
+        levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in pairs]
         if initial is not None:
             flow = follow(levels, initial, s)
         elif len(levels) > 1:
-            flow = solve(levels[: s.fine_levels], finer(guess(levels[1:], s), levels[0]), s)
+            flow = solve(levels[: s.fine_levels], upsample(guess(levels[1:], s), levels[0]), s)
         else:
             flow = solve(levels, None, s)
-        flow = steadied(flow, s.steady_px)
+        flow = smooth_noise(flow, s.steady_px)
         warped, visible = image.warp(levels[0].now, levels[0].now_usable, flow)
         return flow, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
@@ -131,7 +131,7 @@ def pyramid(grey: Map, usable: Map, s: TVL1Settings) -> list[tuple[Map, Map]]:
         levels.append((image.normalise(grey, usable), usable * (usable > 0.1)))
         if min(grey.shape) < 2 * s.coarsest_px:
             return levels
-        grey, usable = image.halved(np.stack([grey * usable, usable]))
+        grey, usable = image.halve(np.stack([grey * usable, usable]))
         grey = np.asarray(grey / np.maximum(usable, 1e-6), np.float32)
 
 
@@ -144,7 +144,7 @@ def guess(levels: list[Level], s: TVL1Settings) -> Map:
     weights = s.small_motion_weight, s.large_motion_weight
     small, large = (solve(levels, None, s.first_stage(weight)) for weight in weights)
     warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
-    trust = [float(confidence.agreement(levels[0], *one).mean()) for one in warped]
+    trust = [float(confidence.agreement(levels[0], *pictures).mean()) for pictures in warped]
     return large if trust[1] > _BETTER * trust[0] else small
 
 
@@ -167,11 +167,13 @@ def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
         return solve(levels, last, s)
     weight, start = _weights(last.shape[1:], last, s), _pyramid(last, len(levels))
     coarse, all_smooth = levels[_FINE:], replace(s, bending_px=0.0)
-    both = [_refine(coarse, start[-1], weight, all_smooth, kept) for kept in (None, start[_FINE:])]
-    warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in both]
+    flows = [
+        _refine(coarse, start[-1], weight, all_smooth, references) for references in (None, start[_FINE:])
+    ]
+    warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in flows]
     trust = [confidence.agreement(coarse[0], *pictures) for pictures in warped]
     share = np.clip(_HALF + (trust[1] - trust[0]) / np.float32(s.better), 0, 1)
-    flow = finer(both[0] + share * (both[1] - both[0]), levels[_FINE - 1])
+    flow = upsample(flows[0] + share * (flows[1] - flows[0]), levels[_FINE - 1])
     return _refine(levels[:_FINE], flow, weight, s)
 
 
@@ -187,38 +189,38 @@ def _pyramid(flow: Map, count: int) -> list[Map]:
     """A flow (2, H, W) px on so many levels, in pixels of each."""
     levels = [flow]
     for _ in range(count - 1):
-        levels.append(np.float32(0.5) * image.halved(levels[-1]))
+        levels.append(np.float32(0.5) * image.halve(levels[-1]))
     return levels
 
 
 def _refine(
-    levels: list[Level], flow: Map, weight: Map, s: TVL1Settings, kept: list[Map] | None = None
+    levels: list[Level], flow: Map, weight: Map, s: TVL1Settings, references: list[Map] | None = None
 ) -> Map:
-    """Flow of the finest level from that of the coarsest; `kept`: on each level, see `_solve_level`."""
+    """Flow of the finest level from that of the coarsest; `references`: on each level, see `_solve_level`."""
     for k in reversed(range(len(levels))):
         shape = levels[k].now.shape
         if flow.shape[1:] != shape:
-            flow = finer(flow, levels[k])
-        here = image.resized(weight[None], shape)[0]
-        part = None if kept is None else kept[k]
-        flow = _solve_level(levels[k], flow, here, s, part, 0.0 if k else s.bending_px)
+            flow = upsample(flow, levels[k])
+        level_weight = image.resize(weight[None], shape)[0]
+        reference = None if references is None else references[k]
+        flow = _solve_level(levels[k], flow, level_weight, s, reference, 0.0 if k else s.bending_px)
     return flow
 
 
 def _solve_level(
-    level: Level, flow: Map, weight: Map, s: TVL1Settings, kept: Map | None, bending_px: float
+    level: Level, flow: Map, weight: Map, s: TVL1Settings, reference: Map | None, bending_px: float
 ) -> Map:
     """All warps of a level: each linearises r about the flow, weights it and minimises the energy.
 
-    The smoothness term sees the flow less `kept` (2, H, W), or less its Gaussian mean: of all of it, it damps
-    a wave of wavenumber k by 1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
+    The smoothness term sees the flow less `reference` (2, H, W), or less its Gaussian mean: of all of it, it
+    damps a wave of wavenumber k by 1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
     """
     rest, now, rest_usable, now_usable = level.rest, level.now, level.rest_usable, level.now_usable
-    found = flow.copy()
+    solution = flow.copy()
     numbers = np.array([s.tau, s.gradient, s.epsilon, s.huber, s.hidden_huber], np.float32)
     before, after = np.empty((2, 6, *rest.shape), np.float32)
-    mask, spare = np.empty((2, *rest.shape), np.float32)
-    here = weight
+    mask, unused = np.empty((2, *rest.shape), np.float32)
+    scaled_weight = weight
     state = new_state(*rest.shape)
     mean: Map | np.float32
 
@@ -226,56 +228,56 @@ def _solve_level(
         """Writes d_x, d_y, d_xx, d_xy, d_yy of the first plane to the others."""
         kernels.differentiate(planes[0], planes[1], planes[2])
         kernels.differentiate(planes[1], planes[3], planes[4])
-        kernels.differentiate(planes[2], spare, planes[5])
+        kernels.differentiate(planes[2], unused, planes[5])
 
     before[0] = rest
     differentiate(before)
     for _ in range(s.warps):
-        kernels.warp_into(now, now_usable, found, after[0], mask)
+        kernels.warp_into(now, now_usable, solution, after[0], mask)
         mask *= rest_usable
         differentiate(after)
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
-            here = weight * np.float32(np.clip(share, *_WEIGHT_LIMITS))
-        last, mean = found, _ZERO if kept is None else kept
+            scaled_weight = weight * np.float32(np.clip(share, *_WEIGHT_LIMITS))
+        last, mean = solution, _ZERO if reference is None else reference
         if bending_px > 0:
-            mean = image.doubled(image.window(last, bending_px), rest.shape)
-        found = last - mean
-        linearise(before, after, mask, here, found, numbers, state)
-        primal_dual(found, state, np.float32(s.tau), s.steps)
+            mean = image.double(image.window(last, bending_px), rest.shape)
+        solution = last - mean
+        linearise(before, after, mask, scaled_weight, solution, numbers, state)
+        primal_dual(solution, state, np.float32(s.tau), s.steps)
         if s.median:
-            found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
-        found = found + mean
-        change = found - last
+            solution = np.stack([cv2.medianBlur(plane, 3) for plane in solution])
+        solution = solution + mean
+        change = solution - last
         if (mask * change**2).sum() < s.settled_px**2 * mask.sum():
             break
-    return found
+    return solution
 
 
-def steadied(flow: Map, within_px: float) -> Map:
+def smooth_noise(flow: Map, within_px: float) -> Map:
     """Smooths a flow (2, H, W) px by about a Gaussian of 1.4 px where that changes it by little."""
-    smooth = flow
+    blurred = flow
     for _ in range(3):
-        smooth = image.box(smooth, 1)
-    change = smooth - flow
+        blurred = image.box(blurred, 1)
+    change = blurred - flow
     return np.asarray(flow + change * np.exp(-(change * change).sum(0) / within_px**2), np.float32)
 
 
-def finer(flow: Map, level: Level) -> Map:
+def upsample(flow: Map, level: Level) -> Map:
     """Upsamples the flow (2, h, w) of the next coarser level to `level`: (2, H, W) in its pixels."""
-    return np.asarray(2 * image.doubled(flow, level.now.shape), np.float32)
+    return np.asarray(2 * image.double(flow, level.now.shape), np.float32)
 
 
 def steepness(flow: Map) -> Map:
     """|grad w|^2 (H, W) of w averaged over 16 x 16 px, which removes the noise."""
     size, rows, columns = 16, *(np.arange(0, n, 16) for n in flow.shape[1:])
     sums = np.add.reduceat(np.add.reduceat(flow, rows, 1), columns, 2)
-    areas = [np.minimum(size, n - at) for n, at in zip(flow.shape[1:], (rows, columns), strict=True)]
-    wide = np.pad(sums / np.outer(*areas).astype(np.float32), ((0, 0), (1, 1), (1, 1)), "edge")
-    dx, dy = wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2], wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]
+    areas = [np.minimum(size, n - starts) for n, starts in zip(flow.shape[1:], (rows, columns), strict=True)]
+    extended = np.pad(sums / np.outer(*areas).astype(np.float32), ((0, 0), (1, 1), (1, 1)), "edge")
+    dx, dy = extended[:, 1:-1, 2:] - extended[:, 1:-1, :-2], extended[:, 2:, 1:-1] - extended[:, :-2, 1:-1]
     slope = (dx * dx + dy * dy).sum(0) / np.float32((2 * size) ** 2)
-    found: Map = image.resized(slope[None], flow.shape[1:])[0]
-    return found
+    upsampled: Map = image.resize(slope[None], flow.shape[1:])[0]
+    return upsampled
 
 
 @argument_types("f4[:,:,::1], f4[:,:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], f4[::1], f4[:,:,::1]")
@@ -349,21 +351,21 @@ def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
 @argument_types("f4[:,:,::1], i8, f4, f4, f4[::1], i8")
 @vectorised
 def _descend(state: Map, height: int, tau: np.float32, sigma: np.float32, sigma_x: Map, steps: int) -> None:
-    wide = len(sigma_x)
+    width = len(sigma_x)
     now, ahead, px, py, prox, shrink = state[:2], state[2:4], state[4:6], state[6:8], state[8:13], state[13]
     for sweep in range(height + steps - 1):
         for k in range(max(0, sweep - height + 1), min(steps, sweep + 1)):
             y = sweep - k
             below = min(y + 1, height - 1)
             for c in range(2):
-                for x in range(wide):
-                    here = ahead[c, y, x]
-                    p = px[c, y + 1, x + _LANES] + sigma_x[x] * (ahead[c, y, x + 1] - here)
-                    q = py[c, y + 1, x] + sigma * (ahead[c, below, x] - here)
+                for x in range(width):
+                    centre = ahead[c, y, x]
+                    p = px[c, y + 1, x + _LANES] + sigma_x[x] * (ahead[c, y, x + 1] - centre)
+                    q = py[c, y + 1, x] + sigma * (ahead[c, below, x] - centre)
                     p, q = p * shrink[y, x], q * shrink[y, x]
                     norm = _ONE / np.sqrt(max(_ONE, p * p + q * q))
                     px[c, y + 1, x + _LANES], py[c, y + 1, x] = p * norm, q * norm
-            for x in range(wide):
+            for x in range(width):
                 u, v = now[0, y, x], now[1, y, x]
                 a = px[0, y + 1, x + _LANES] - px[0, y + 1, x + _LANES - 1] + py[0, y + 1, x] - py[0, y, x]
                 b = px[1, y + 1, x + _LANES] - px[1, y + 1, x + _LANES - 1] + py[1, y + 1, x] - py[1, y, x]

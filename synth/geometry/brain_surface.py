@@ -67,23 +67,23 @@ def place_brain(
 ) -> Brain:
     """Places a surface of vertices (V, 3) mm and faces (F, 3) as `load_brain`; `name` is used in messages."""
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
-    turn, origin = axes(out), np.asarray(craniotomy.point)
-    placed = (vertices - origin) @ turn.T
+    rotation, origin = axes(out), np.asarray(craniotomy.point)
+    placed = (vertices - origin) @ rotation.T
     heights = _heights(placed, faces)
     heights = heights[np.abs(heights) <= craniotomy.radius_mm]
     _check_place(name, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
-    origin = origin + heights.max() * turn[2]
-    placed_attachments = tuple(_turn(attachment, turn, origin) for attachment in attachments)
+    origin = origin + heights.max() * rotation[2]
+    placed_attachments = tuple(_transform(attachment, rotation, origin) for attachment in attachments)
     to_world = np.eye(4)
-    to_world[:3] = np.column_stack([turn, -turn @ origin])
+    to_world[:3] = np.column_stack([rotation, -rotation @ origin])
     return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, placed_attachments)
 
 
-def _turn(attachment: Attachment, turn: Floats, origin: Floats) -> Attachment:
+def _transform(attachment: Attachment, rotation: Floats, origin: Floats) -> Attachment:
     """An attachment of a surface's own axes in axes turned by (3, 3) about an origin (3,) mm."""
-    x, y, z = turn @ (attachment.point - origin)
-    normal = None if attachment.normal is None else tuple(turn @ np.asarray(attachment.normal))
+    x, y, z = rotation @ (attachment.point - origin)
+    normal = None if attachment.normal is None else tuple(rotation @ np.asarray(attachment.normal))
     return replace(attachment, point=(x, y, z), normal=normal)
 
 
@@ -101,14 +101,14 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
     span = np.ptp(vertices, axis=0)
     if not _BRAIN_MM[0] <= span.max() <= _BRAIN_MM[1]:
         unit, factor = min(_UNITS_MM.items(), key=lambda unit: abs(np.log(unit[1] * span.max() / 150)))
-        likely = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
-        hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if likely else "convert it to mm"
+        match = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
+        hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if match else "convert it to mm"
         raise UserError(f"anatomy.mesh: {path.name} is {span.max():.3g} mm long, a brain 100 to 200; {hint}")
     faces = _orient(vertices, faces)
     if fill_holes:
         faces = _fill_holes(vertices, faces, path.name)
-    flat = len(faces) < 4 or span.min() < 1e-3 * span.max()
-    if flat or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod():
+    is_flat = len(faces) < 4 or span.min() < 1e-3 * span.max()
+    if is_flat or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod():
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -131,36 +131,38 @@ def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_
     """
     from trimesh.triangles import closest_point
 
-    def nearest(place: Floats) -> tuple[float, Floats, int]:
-        feet = np.asarray(closest_point(corners, np.broadcast_to(place, (len(corners), 3))))
-        away = np.linalg.norm(feet - place, axis=1)
-        return float(away.min()), feet[away.argmin()], int(away.argmin())
+    def find_nearest(place: Floats) -> tuple[float, Floats, int]:
+        closest = np.asarray(closest_point(corners, np.broadcast_to(place, (len(corners), 3))))
+        distances = np.linalg.norm(closest - place, axis=1)
+        return float(distances.min()), closest[distances.argmin()], int(distances.argmin())
 
     def text(vector: Floats) -> str:
         return "[" + ", ".join(f"{x:.2f}" for x in vector) + "]"
 
-    (gap, foot, face), turned = nearest(point), []
+    (gap, foot, face), mirrors = find_nearest(point), []
     for what, sign in (("x and y", [-1, -1, 1]), ("x", [-1, 1, 1]), ("y", [1, -1, 1]), ("z", [1, 1, -1])):
-        turned.append((nearest(point * sign)[0], f"; with {what} negated, {text(point * sign)}, it is "))
-    left, hint = min(turned)
-    if gap > radius_mm or gap > _CLICKED_MM + 3 * left:
-        hint = f"{hint}{left:.2g} mm off (other axes?)" if left < max(1.0, gap) / 3 else ""
+        mirrors.append(
+            (find_nearest(point * sign)[0], f"; with {what} negated, {text(point * sign)}, it is ")
+        )
+    mirror_gap, hint = min(mirrors)
+    if gap > radius_mm or gap > _CLICKED_MM + 3 * mirror_gap:
+        hint = f"{hint}{mirror_gap:.2g} mm off (other axes?)" if mirror_gap < max(1.0, gap) / 3 else ""
         raise UserError(
             f"anatomy.craniotomy.point: {text(point)} is {gap:.2g} mm off the surface of {name}{hint}. "
             f"The nearest point is {text(foot)}; `synth preview {name}` finds places"
         )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    middle = corners.mean(axis=1)
-    opened = np.linalg.norm(middle - foot, axis=1) <= radius_mm
-    near = normals[opened].sum(axis=0)
-    if np.linalg.norm(near) < _THIN * np.linalg.norm(normals[opened], axis=1).sum():
-        near = normals[opened & (normals @ normals[face] > 0)].sum(axis=0)
-    near *= np.sign(((middle - middle.mean(axis=0)) * normals).sum())  # all may face inwards
-    if near.any() and out @ near < _STEEPEST * np.linalg.norm(near):
-        where = "into the tissue" if out @ near < 0 else "along the surface"
+    centroids = corners.mean(axis=1)
+    in_opening = np.linalg.norm(centroids - foot, axis=1) <= radius_mm
+    normal = normals[in_opening].sum(axis=0)
+    if np.linalg.norm(normal) < _THIN * np.linalg.norm(normals[in_opening], axis=1).sum():
+        normal = normals[in_opening & (normals @ normals[face] > 0)].sum(axis=0)
+    normal *= np.sign(((centroids - centroids.mean(axis=0)) * normals).sum())  # all may face inwards
+    if normal.any() and out @ normal < _STEEPEST * np.linalg.norm(normal):
+        heading = "into the tissue" if out @ normal < 0 else "along the surface"
         raise UserError(
-            f"anatomy.craniotomy.direction: {text(out)} points {where} of {name} at "
-            f"{text(point)}; outwards is {text(near / np.linalg.norm(near))} (are both in the same axes?)"
+            f"anatomy.craniotomy.direction: {text(out)} points {heading} of {name} at "
+            f"{text(point)}; outwards is {text(normal / np.linalg.norm(normal))} (are both in the same axes?)"
         )
 
 
@@ -176,9 +178,9 @@ def axes(out: Floats) -> Floats:
 def _heights(vertices: Floats, faces: Ints) -> Floats:
     """Heights at which the z axis intersects the faces [mm]."""
     parts = side_areas(np.zeros(2), vertices, faces)
-    whole = parts.sum(axis=1)
-    hit = (np.abs(whole) > 1e-12) & ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1))
-    return np.asarray((parts[hit] * vertices[faces[hit], 2]).sum(axis=1) / whole[hit])
+    total = parts.sum(axis=1)
+    hit = (np.abs(total) > 1e-12) & ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1))
+    return np.asarray((parts[hit] * vertices[faces[hit], 2]).sum(axis=1) / total[hit])
 
 
 def _read(path: Path) -> tuple[Floats, Ints]:
@@ -188,12 +190,12 @@ def _read(path: Path) -> tuple[Floats, Ints]:
     if data.startswith(_FREESURFER):
         kind = "freesurfer"
     elif kind not in _KINDS:
-        known = f"{', '.join(_KINDS)}, nor a surface of FreeSurfer's such as lh.pial"
+        kinds = f"{', '.join(_KINDS)}, nor a surface of FreeSurfer's such as lh.pial"
         hint = "gunzip unpacks it" if kind == "gz" else "3D Slicer converts most others"
-        raise UserError(f"anatomy.mesh: {path.name} is none of {known}; {hint}")
+        raise UserError(f"anatomy.mesh: {path.name} is none of {kinds}; {hint}")
 
-    stated = re.search(_STATED, data[:4096])
-    space, offset = stated[1].decode() if stated else "", np.zeros(3)
+    header = re.search(_STATED, data[:4096])
+    space, offset = header[1].decode() if header else "", np.zeros(3)
     try:
         if kind in ("gii", "freesurfer"):
             vertices, faces, offset = _read_neuroimaging(path, data)
@@ -209,8 +211,8 @@ def _read(path: Path) -> tuple[Floats, Ints]:
     except ModuleNotFoundError as error:
         raise UserError(f"anatomy.mesh: {path.name} needs {error.name}: pip install {error.name}") from None
     except Exception as error:  # readers of formats raise anything
-        why = first_line(error)
-        raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({why})") from error
+        reason = first_line(error)
+        raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({reason})") from error
     if space not in ("", "RAS"):
         vertices = vertices * [1 if c in "RAS" else -1 for c in space]
         warnings.warn(
@@ -220,9 +222,9 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             stacklevel=1,
         )
     if offset.any():
-        plus = f"scanner RAS is this plus {offset.round(2).tolist()}"
+        note = f"scanner RAS is this plus {offset.round(2).tolist()}"
         what = f"{path.name} and points on it are in surface RAS, SurfaceRAS in freeview"
-        warnings.warn(f"anatomy.mesh: {what}; {plus}", Caution, stacklevel=1)
+        warnings.warn(f"anatomy.mesh: {what}; {note}", Caution, stacklevel=1)
     return _merge(vertices, faces)
 
 
@@ -239,10 +241,10 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
     else:
         _refuse_expansion(data)
         image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
-        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
-        if [[array.data.shape[1:] for array in arrays] for arrays in held] != [[(3,)], [(3,)]]:
+        groups = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
+        if [[array.data.shape[1:] for array in arrays] for arrays in groups] != [[(3,)], [(3,)]]:
             raise ValueError("one list of points and one of triangles are needed, as in a .surf.gii")
-        points, vertices, faces = held[0][0], held[0][0].data, held[1][0].data
+        points, vertices, faces = groups[0][0], groups[0][0].data, groups[1][0].data
         if points.coordsys is None or points.coordsys.dataspace != 1:  # 1: NIFTI_XFORM_SCANNER_ANAT
             offset = np.array([float(points.meta.get(f"VolGeomC_{axis}", 0)) for axis in "RAS"])
     return np.asarray(vertices, np.float64), np.asarray(faces, np.int64), offset
@@ -250,13 +252,13 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
 
 def _refuse_expansion(data: bytes) -> None:
     """ValueError if the compressed arrays of a GIfTI file expand to more than a file may have."""
-    left = checked_file.LARGEST_MESH
+    budget = checked_file.LARGEST_MESH
     for text in re.findall(rb"<Data>([^<]*)</Data>", data) if b"GZipBase64Binary" in data else ():
         unpacker, packed = zlib.decompressobj(), base64.b64decode(text)
         while packed and not unpacker.eof:
-            left -= len(unpacker.decompress(packed, 1 << 20))
+            budget -= len(unpacker.decompress(packed, 1 << 20))
             packed = unpacker.unconsumed_tail
-            if left < 0:
+            if budget < 0:
                 raise ValueError("its arrays expand to more than 1 GB")
 
 
@@ -290,8 +292,8 @@ def _merge(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     _, first, place = np.unique(np.round(vertices / step), axis=0, return_index=True, return_inverse=True)
     faces = place.ravel()[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(once)]
+    _, unique_faces = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(unique_faces)]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[first][used], faces.reshape(-1, 3)
 
@@ -302,9 +304,9 @@ def _fill_holes(vertices: Floats, faces: Ints, name: str) -> Ints:
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not trimesh.repair.fill_holes(mesh, use_fan=True):
-        odd = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
-        why = f"{odd} edges stay open" if odd else "edges have more than two faces"
-        raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); repair it in a mesh editor")
+        open_edges = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
+        reason = f"{open_edges} edges stay open" if open_edges else "edges have more than two faces"
+        raise UserError(f"anatomy.fill_holes: {name} can't be closed ({reason}); repair it in a mesh editor")
     return np.asarray(mesh.faces, np.int64)
 
 

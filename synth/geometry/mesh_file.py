@@ -95,18 +95,18 @@ class _Cells:
         if sizes.min(initial=0) < 0 or (len(ends) and not 0 <= kinds.min() <= kinds.max() < 256):
             raise ValueError("a cell's size or type is out of range")
         for kind in np.unique(kinds).tolist():
-            mine = kinds == kind
-            corners, each = nodes[np.repeat(mine, sizes)], sizes[mine]
+            members = kinds == kind
+            corners, counts = nodes[np.repeat(members, sizes)], sizes[members]
             if kind in IGNORED:
-                corners = np.zeros((len(each), 1), np.int64)  # present, without a face
+                corners = np.zeros((len(counts), 1), np.int64)  # present, without a face
             elif kind in (_POLYGON, _STRIP):
-                kind, corners = TRIANGLE, _triangles(corners, each, kind == _STRIP)
+                kind, corners = TRIANGLE, _triangles(corners, counts, kind == _STRIP)
             else:
                 kind, order = _REGULAR.get(kind, (kind, slice(None)))
-                size = CELLS[kind].nodes if kind in CELLS else int(each[0])
-                if (each != size).any():
-                    raise ValueError(f"a cell of VTK's type {kind} has {each[each != size][0]} nodes")
-                corners = corners.reshape(len(each), size)[:, order]
+                size = CELLS[kind].nodes if kind in CELLS else int(counts[0])
+                if (counts != size).any():
+                    raise ValueError(f"a cell of VTK's type {kind} has {counts[counts != size][0]} nodes")
+                corners = corners.reshape(len(counts), size)[:, order]
             self._parts.setdefault(kind, []).append(corners)
 
     def join(self) -> dict[int, Ints]:
@@ -132,8 +132,8 @@ def read_surface(data: bytes, suffix: str, *, in_order: bool = True) -> tuple[Fl
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     data = check_surface(data, suffix)
-    given = {"maintain_order": True, "skip_materials": True} if in_order else {}
-    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, force="mesh", process=False, **given)
+    options = {"maintain_order": True, "skip_materials": True} if in_order else {}
+    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, force="mesh", process=False, **options)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
@@ -147,7 +147,7 @@ def check_surface(data: bytes, suffix: str) -> bytes:
         return _complete_stl(data)
     if suffix in ("obj", "off") or (suffix == "ply" and b"format ascii" in data[:1000]):
         if suffix == "obj":
-            data = _shape_of_obj(data)
+            data = _strip_obj(data)
         if max(map(len, data.splitlines()), default=0) > _LONGEST_LINE:
             raise ValueError(f"a line has over {_LONGEST_LINE} characters; has a face thousands of corners?")
         try:
@@ -161,17 +161,17 @@ def _complete_stl(data: bytes) -> bytes:
     """An STL with the number of faces that its size gives. ValueError if its header counts others."""
     if len(data) < 84 or (data[:5].lower() == b"solid" and b"facet" in data[:1000].lower()):
         return data
-    count, held = struct.unpack_from("<I", data, 80)[0], (len(data) - 84) // 50
-    if count not in (0, held):
-        raise ValueError(f"its header counts {count} faces, its size {held}")
-    return data[:80] + struct.pack("<I", held) + data[84 : 84 + 50 * held]
+    count, face_count = struct.unpack_from("<I", data, 80)[0], (len(data) - 84) // 50
+    if count not in (0, face_count):
+        raise ValueError(f"its header counts {count} faces, its size {face_count}")
+    return data[:80] + struct.pack("<I", face_count) + data[84 : 84 + 50 * face_count]
 
 
-def _shape_of_obj(data: bytes) -> bytes:
+def _strip_obj(data: bytes) -> bytes:
     """Vertices and faces of an .obj alone, in order: groups, materials and textures split its vertices."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
-    kept = (line for line in lines if line.split(None, 1)[:1] in ([b"v"], [b"f"]))
-    return re.sub(rb"/\S*", b"", b"\n".join(kept)) + b"\n"
+    shape_lines = (line for line in lines if line.split(None, 1)[:1] in ([b"v"], [b"f"]))
+    return re.sub(rb"/\S*", b"", b"\n".join(shape_lines)) + b"\n"
 
 
 def _refuse_hollow(data: bytes) -> None:
@@ -219,29 +219,29 @@ def _read_xml(data: bytes) -> MeshFile:
     if root.tag != "VTKFile" or root.get("type") not in ("UnstructuredGrid", "PolyData"):
         raise ValueError(f"it holds {root.get('type') or root.tag}, not an unstructured grid or polygons")
     array, file, cells = _xml_arrays(root, rest), MeshFile(), _Cells()
-    points, each, before = list[Floats](), list[tuple[int, dict[str, ET.Element]]](), 0
+    points, pieces, point_offset = list[Floats](), list[tuple[int, dict[str, ET.Element]]](), 0
     for piece in root.iter("Piece"):
-        listed = piece.get("NumberOfPoints")
-        if listed is not None and int(listed) == 0:
+        expected = piece.get("NumberOfPoints")
+        if expected is not None and int(expected) == 0:
             continue
-        here = array(piece.find("Points/DataArray"), None if listed is None else 3 * int(listed))
-        points.append(here.reshape(-1, 3).astype(np.float64))
+        coordinates = array(piece.find("Points/DataArray"), None if expected is None else 3 * int(expected))
+        points.append(coordinates.reshape(-1, 3).astype(np.float64))
         count = len(points[-1])
         for name, kind in _XML_CELLS.items():
             stated = piece.get("NumberOfCells" if kind is None else f"NumberOf{name}")
             number = None if stated is None else int(stated)
             parts = {str(child.get("Name")): child for child in piece.iterfind(f"{name}/DataArray")}
             if {"connectivity", "offsets"} <= set(parts) and number != 0:
-                ends = whole(array(parts["offsets"], number))
-                kinds = whole(array(parts["types"], number)) if kind is None else kind
-                cells.add(kinds, before + whole(array(parts["connectivity"])), ends)
-        data_here = {str(child.get("Name")): child for child in piece.iterfind("PointData/DataArray")}
+                ends = as_integers(array(parts["offsets"], number))
+                kinds = as_integers(array(parts["types"], number)) if kind is None else kind
+                cells.add(kinds, point_offset + as_integers(array(parts["connectivity"])), ends)
+        piece_arrays = {str(child.get("Name")): child for child in piece.iterfind("PointData/DataArray")}
         if count:
-            each.append((count, data_here))
-        before += count
+            pieces.append((count, piece_arrays))
+        point_offset += count
     file.points, file.cells = np.concatenate([np.zeros((0, 3)), *points]), cells.join()
-    for name in dict.fromkeys(name for _, here in each for name in here):
-        nodes = [(count, here.get(name)) for count, here in each]
+    for name in dict.fromkeys(name for _, arrays in pieces for name in arrays):
+        nodes = [(count, arrays.get(name)) for count, arrays in pieces]
         if (parts_of := _count_parts(nodes, array)) is not None:
             file.point_data[name] = PointArray(parts_of, partial(_join, nodes, parts_of, array))
     for child in root.iterfind(".//FieldData/"):
@@ -257,24 +257,24 @@ _Nodes = list[tuple[int, ET.Element | None]]  # of an array: points of each piec
 
 def _count_parts(nodes: _Nodes, array: _Reader) -> int | None:
     """Numbers at each point of an array; where it states none, by its length. None: pieces differ."""
-    stated = {child.get("NumberOfComponents") for _, child in nodes if child is not None}
-    if stated == {None}:
+    part_counts = {child.get("NumberOfComponents") for _, child in nodes if child is not None}
+    if part_counts == {None}:
         count, node = next((count, child) for count, child in nodes if child is not None)
         length = len(array(node))
         return length // count if length and length % count == 0 else None
-    return int(stated.pop() or 1) if len(stated) == 1 else None
+    return int(part_counts.pop() or 1) if len(part_counts) == 1 else None
 
 
 def _join(nodes: _Nodes, parts: int, array: _Reader) -> Numbers:
     """An array (N, parts) over all pieces; 0 in those without it."""
-    each = [
+    pieces = [
         np.zeros((count, parts)) if child is None else array(child, parts * count).reshape(count, parts)
         for count, child in nodes
     ]
-    return each[0] if len(each) == 1 else np.concatenate(each)
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
 
-def whole(numbers: Numbers) -> Ints:
+def as_integers(numbers: Numbers) -> Ints:
     """Whole numbers (...) as int64. ValueError: one is not whole."""
     if numbers.dtype.kind not in "iu" and not (
         numbers.dtype.kind == "f" and (np.abs(numbers) < 2**53).all() and (numbers == np.rint(numbers)).all()
@@ -348,9 +348,9 @@ def _unpack(data: bytes, word: np.dtype[np.number], packer: str | None, limit: i
         raise ValueError(f"an array expands to {total} bytes, {limit} are expected at most")
     refuse_excess(total)
     stops, parts = np.cumsum([width * (count + 3), *packed]), list[bytes]()
-    for (start, end), wanted in zip(pairwise(stops.tolist()), sizes, strict=True):
-        part = _PACKERS[packer]().decompress(data[start:end], wanted + 1)
-        if len(part) != wanted:
+    for (start, end), block_size in zip(pairwise(stops.tolist()), sizes, strict=True):
+        part = _PACKERS[packer]().decompress(data[start:end], block_size + 1)
+        if len(part) != block_size:
             raise ValueError("a block has another size than it states; is it truncated?")
         parts.append(part)
     return b"".join(parts)
@@ -361,9 +361,9 @@ def _parse(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
     kind = np.int64 if dtype.kind in "iu" else np.float64
     if len(text) < 2000:
         return np.array([kind(word) for word in text.split()], kind)
-    filled = np.frombuffer(text, np.uint8) > ord(" ")
-    count = int(filled[0]) + int(
-        (filled[1:] & ~filled[:-1]).sum()
+    is_text = np.frombuffer(text, np.uint8) > ord(" ")
+    count = int(is_text[0]) + int(
+        (is_text[1:] & ~is_text[:-1]).sum()
     )  # of words; a list of them is 20 times the text
     refuse_excess(8 * count)
     with warnings.catch_warnings():
@@ -426,18 +426,18 @@ class _Legacy:
         kind = head[2].strip().upper() if len(head) == 4 else b""  # head[1] is the title
         if kind not in (b"ASCII", b"BINARY"):
             raise ValueError("its third line is neither ASCII nor BINARY")
-        self._data, self._at, self._binary = data, len(data) - len(head[3]), kind == b"BINARY"
+        self._data, self._position, self._binary = data, len(data) - len(head[3]), kind == b"BINARY"
 
     def words(self) -> list[str]:
         """Words of the next non-empty line; none at the end. Blocks of metadata are passed over."""
-        while self._at < len(self._data):
-            end = self._data.find(b"\n", self._at)
+        while self._position < len(self._data):
+            end = self._data.find(b"\n", self._position)
             end = len(self._data) if end < 0 else end
-            line_words = self._data[self._at : end].decode("latin-1").split()
-            self._at = end + 1
+            line_words = self._data[self._position : end].decode("latin-1").split()
+            self._position = end + 1
             if line_words == ["METADATA"]:
-                blank = _BLANK.search(self._data, self._at - 1)
-                self._at = blank.end() if blank else len(self._data)
+                blank = _BLANK.search(self._data, self._position - 1)
+                self._position = blank.end() if blank else len(self._data)
             elif line_words:
                 return line_words
         return []
@@ -452,17 +452,17 @@ class _Legacy:
         """Passes over the next `count` numbers of a type; what is returned reads them in a shape."""
         if kind.lower() not in _LEGACY_TYPES:
             raise ValueError(f"unknown type {kind[:20]!r}")
-        dtype, start = np.dtype(f">{_LEGACY_TYPES[kind.lower()]}"), self._at
+        dtype, start = np.dtype(f">{_LEGACY_TYPES[kind.lower()]}"), self._position
         least = count * dtype.itemsize if self._binary else 2 * count - 1  # digits, and what parts them
         if count < 0 or least > len(self._data) - start:
             raise ValueError(f"it ends before the {count} numbers that are stated; is it truncated?")
         if self._binary:
-            self._at += count * dtype.itemsize
+            self._position += count * dtype.itemsize
             return lambda: (
                 np.frombuffer(self._data, dtype, count, start).astype(dtype.newbyteorder("=")).reshape(shape)
             )
         stop = _WORD_LINE.search(self._data, start - 1)
-        self._at = end = stop.start() if stop else len(self._data)
+        self._position = end = stop.start() if stop else len(self._data)
 
         def read() -> Numbers:
             values = _parse(self._data[start:end], dtype)
@@ -474,12 +474,12 @@ class _Legacy:
 
     def cells(self, count: int, size: int) -> tuple[Ints, Ints]:
         """Nodes of cells one after another, and where each ends."""
-        start, words = self._at, self.words()
+        start, words = self._position, self.words()
         if words[:1] == ["OFFSETS"]:  # since 5.1: `count` offsets, then `size` point numbers
-            offsets = whole(self.numbers(count, words[1])())
-            return whole(self.numbers(size, self.words()[1])()), offsets[1:]
-        self._at = start
-        numbers = whole(self.numbers(size, "int")())
+            offsets = as_integers(self.numbers(count, words[1])())
+            return as_integers(self.numbers(size, self.words()[1])()), offsets[1:]
+        self._position = start
+        numbers = as_integers(self.numbers(size, "int")())
         if not 0 <= count <= size:
             raise ValueError(f"{count} cells can't consist of {size} numbers")
         if count and size % count == 0 and (numbers[:: size // count] == size // count - 1).all():

@@ -56,20 +56,20 @@ def skin(points: Floats, cells: Mapping[int, Ints]) -> Ints:
     inside. Cells that are faces themselves are used only where there are no volumes, as they are. ValueError:
     a type without a table here or with other nodes, none with a face, a node that is not among the points.
     """
-    known = {kind: nodes for kind, nodes in cells.items() if len(nodes) and kind not in IGNORED}
-    if odd := sorted(set(known) - set(CELLS)):
-        raise ValueError(f"cells of VTK's type {odd[0]} are not supported")
-    if not known:
+    face_cells = {kind: nodes for kind, nodes in cells.items() if len(nodes) and kind not in IGNORED}
+    if unsupported := sorted(set(face_cells) - set(CELLS)):
+        raise ValueError(f"cells of VTK's type {unsupported[0]} are not supported")
+    if not face_cells:
         lines = "; it has lines or points only" if any(map(len, cells.values())) else ""
         raise ValueError(f"it has no cells with a surface{lines}")
-    for kind, nodes in known.items():
+    for kind, nodes in face_cells.items():
         if nodes.shape[1:] != (CELLS[kind].nodes,):
             raise ValueError(f"cells of VTK's type {kind} have {CELLS[kind].nodes} nodes each")
         if nodes.min() < 0 or nodes.max() >= len(points):
             raise ValueError("a cell refers to a missing point")
-    volumes = {kind: nodes for kind, nodes in known.items() if kind not in _FLAT}
+    volumes = {kind: nodes for kind, nodes in face_cells.items() if kind not in _FLAT}
     key, parts = list[Ints](), list[Ints]()
-    for kind, nodes in (volumes or known).items():
+    for kind, nodes in (volumes or face_cells).items():
         centre = points[nodes].mean(axis=1)
         for corners in CELLS[kind].faces:
             face = _triangles(kind, corners, nodes)  # (C, k, 3)

@@ -17,10 +17,10 @@ class Shape(NamedTuple):
     faces: Indices  # (F, 3)
 
 
-def joined(*shapes: Shape) -> Shape:
+def join_shapes(*shapes: Shape) -> Shape:
     """One mesh of several, in their order."""
     first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
-    faces = [shape.faces + at for shape, at in zip(shapes, first, strict=False)]
+    faces = [shape.faces + offset for shape, offset in zip(shapes, first, strict=False)]
     vertices = np.concatenate([shape.vertices for shape in shapes])
     return Shape(vertices, np.concatenate(faces).astype(np.int32))
 
@@ -77,8 +77,8 @@ def _weigh_by_area(vertices: Floats, faces: Indices) -> Floats:
             x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
             d0, d1, d2 = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
             e0, e1, e2 = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
-            at = faces[f, corner]
-            total[at, 0] += d1 * e2 - d2 * e1
-            total[at, 1] += d2 * e0 - d0 * e2
-            total[at, 2] += d0 * e1 - d1 * e0
+            vertex = faces[f, corner]
+            total[vertex, 0] += d1 * e2 - d2 * e1
+            total[vertex, 1] += d2 * e0 - d0 * e2
+            total[vertex, 2] += d0 * e1 - d1 * e0
     return total

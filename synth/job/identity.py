@@ -38,20 +38,20 @@ def identify_job(job: Job) -> str:
     Files enter by content, not by path. The card and the number of sequences don't enter: sequence 3 is the
     same in a dataset of 24 and of 48, so a dataset can be extended.
     """
-    described = job.model_dump(mode="json")
-    del described["sequences"], described["card"]
+    values = job.model_dump(mode="json")
+    del values["sequences"], values["card"]
     for (block, name), largest in FILES.items():
-        described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
-    for *steps, key in find_meshes(described):
-        holder: Any = described
+        values[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
+    for *steps, key in find_meshes(values):
+        holder: Any = values
         for step in steps:
             holder = holder[step]
         file = Path(holder[key])
         holder[key] = [file.name, _digest_file(file, checked_file.LARGEST_INSTRUMENT)]
     if job.mechanics.source is not None:
         files = list_files(job.mechanics.source, job.mechanics.force, job.mechanics.instruments)
-        described["mechanics"]["source"] = [_digest_file(file, LARGEST_STATE) for file in files]
-    return digest(described)
+        values["mechanics"]["source"] = [_digest_file(file, LARGEST_STATE) for file in files]
+    return digest(values)
 
 
 def find_meshes(values: dict[str, Any]) -> list[tuple[str | int, ...]]:
@@ -60,14 +60,14 @@ def find_meshes(values: dict[str, Any]) -> list[tuple[str | int, ...]]:
     if not isinstance(fem, dict):
         return []
     tools, lines = fem.get("instrument"), fem.get("instrument_list")
-    each: list[tuple[tuple[str | int, ...], Any]] = [(("fem", "instrument"), tools)]
+    candidates: list[tuple[tuple[str | int, ...], Any]] = [(("fem", "instrument"), tools)]
     if isinstance(tools, list | tuple):
-        each = [(("fem", "instrument", k), tool) for k, tool in enumerate(tools)]
+        candidates = [(("fem", "instrument", k), tool) for k, tool in enumerate(tools)]
     for k, line in enumerate(lines if isinstance(lines, list | tuple) else ()):
         if isinstance(line, dict):
-            each.append((("fem", "instrument_list", k, "instrument"), line.get("instrument")))
+            candidates.append((("fem", "instrument_list", k, "instrument"), line.get("instrument")))
     places = list[tuple[str | int, ...]]()
-    for place, tool in each:
+    for place, tool in candidates:
         if is_mesh_name(tool):
             places.append(place)
         elif isinstance(tool, dict) and isinstance(tool.get("file"), str):
@@ -77,10 +77,12 @@ def find_meshes(values: dict[str, Any]) -> list[tuple[str | int, ...]]:
 
 def list_pictures(folder: Path) -> list[Path]:
     """Pictures in a folder of `appearance.photo`. UserError: there are none."""
-    found = sorted(one for one in folder.iterdir() if one.suffix.lower() in _PICTURES and one.is_file())
-    if not found:
+    pictures = sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in _PICTURES and path.is_file()
+    )
+    if not pictures:
         raise UserError(f"appearance.photo: {folder} holds no picture ({' '.join(_PICTURES)})")
-    return found
+    return pictures
 
 
 def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:
@@ -97,7 +99,7 @@ def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:
 
 def identify_opening(job: Job, index: int, anatomy: str) -> str:
     """Name of the craniotomy of a user's brain with the name `anatomy`, equal in all datasets."""
-    point = job.anatomy.opened(index).craniotomy.point or ()
+    point = job.anatomy.select_opening(index).craniotomy.point or ()
     return f"{anatomy} at " + ", ".join(f"{value:g}" for value in point)
 
 
@@ -105,6 +107,6 @@ def _digest_file(path: Path | None, largest: int) -> str | None:
     if path is None:
         return None
     if path.is_dir():
-        return digest([_digest_file(one, largest) for one in list_pictures(path)])
+        return digest([_digest_file(picture, largest) for picture in list_pictures(path)])
     with checked_file.open_file(path, largest) as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -25,7 +25,7 @@ _HEAD = """\
 """
 
 
-def commented(job: Job | None = None) -> str:
+def document_job(job: Job | None = None) -> str:
     """A job file with every key, its meaning, its range and its value; reading it returns the same job."""
     return _HEAD + "\n".join(section_lines(job or Job())).rstrip() + "\n"
 
@@ -68,18 +68,18 @@ def section_lines(section: BaseModel, indent: str = "") -> list[str]:
 
 def limits(model: type[BaseModel], key: str) -> str:
     """The values that a key allows: "(> 0)", "(linear | stable)"; empty if there is no limit."""
-    described = model.model_json_schema()["properties"][key]
+    spec = model.model_json_schema()["properties"][key]
     signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-    if "anyOf" in described:  # an optional key: only its choices are listed
-        described, signs = described["anyOf"][0], {}
-    described = described.get("propertyNames", described)
-    described = (described.get("prefixItems") or [described.get("items", described)])[0]
-    described = described.get("anyOf", [described])[0]
-    if "enum" in described:
-        return f"({' | '.join(map(str, described['enum']))})"
-    bounds = [(sign, described[name]) for name, sign in signs.items() if name in described]
-    shown = ", ".join(f"{sign} {bound:.12g}" for sign, bound in bounds if abs(bound) < 1e9)
-    return shown and f"({shown})"
+    if "anyOf" in spec:  # an optional key: only its choices are listed
+        spec, signs = spec["anyOf"][0], {}
+    spec = spec.get("propertyNames", spec)
+    spec = (spec.get("prefixItems") or [spec.get("items", spec)])[0]
+    spec = spec.get("anyOf", [spec])[0]
+    if "enum" in spec:
+        return f"({' | '.join(map(str, spec['enum']))})"
+    bounds = [(sign, spec[name]) for name, sign in signs.items() if name in spec]
+    text = ", ".join(f"{sign} {bound:.12g}" for sign, bound in bounds if abs(bound) < 1e9)
+    return text and f"({text})"
 
 
 def scalar(value: Any) -> str:
@@ -89,10 +89,12 @@ def scalar(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, BaseModel):
-        given = {name: getattr(value, name) for name in type(value).model_fields}
-        return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in given.items() if one is not None)}}}"
+        fields = {name: getattr(value, name) for name in type(value).model_fields}
+        return (
+            f"{{{', '.join(f'{name}: {scalar(item)}' for name, item in fields.items() if item is not None)}}}"
+        )
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in value.items())}}}"
+        return f"{{{', '.join(f'{name}: {scalar(item)}' for name, item in value.items())}}}"
     if isinstance(value, tuple):
         return f"[{', '.join(scalar(item) for item in value)}]"
     return "" if value is None else str(value)

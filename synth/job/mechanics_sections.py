@@ -47,7 +47,7 @@ def is_mesh_name(value: object) -> bool:
     return isinstance(value, str) and ("." in value or "/" in value)
 
 
-def _as_own(value: Any) -> Any:
+def _as_mesh(value: Any) -> Any:
     return {"file": value} if is_mesh_name(value) else value
 
 
@@ -60,7 +60,7 @@ _MeshName = Annotated[str, Field(pattern=r"\.(stl|STL|obj|OBJ|ply|PLY)$")]
 _AnyTool = Annotated[
     Annotated[Instrument, Tag("kind")] | Annotated[OwnInstrument, Tag("mesh")],
     Discriminator(_tag),
-    BeforeValidator(_as_own, json_schema_input_type=Instrument | OwnInstrument | _MeshName),
+    BeforeValidator(_as_mesh, json_schema_input_type=Instrument | OwnInstrument | _MeshName),
 ]
 
 
@@ -106,11 +106,11 @@ _Time = FiniteFloat | Annotated[str, Field(max_length=40)]
 
 def _read_times(timing: tuple[float | str, ...]) -> tuple[list[float], str]:
     """The numbers of times such as 0.2 or "0.2 s", and their unit, empty for parts of the sequence."""
-    found = [re.fullmatch(r"\s*(\d*\.?\d+(?:e-\d+)?)\s*(s|ms|)\s*", str(one)) for one in timing]
-    read = [one.groups() for one in found if one]
-    if len(read) < len(timing) or len({unit for _, unit in read}) > 1:
+    matches = [re.fullmatch(r"\s*(\d*\.?\d+(?:e-\d+)?)\s*(s|ms|)\s*", str(time)) for time in timing]
+    parts = [match.groups() for match in matches if match]
+    if len(parts) < len(timing) or len({unit for _, unit in parts}) > 1:
         raise ValueError("timing: give four parts of the sequence such as 0.2, or four times such as 0.2 s")
-    return [float(number) for number, _ in read], read[0][1]
+    return [float(number) for number, _ in parts], parts[0][1]
 
 
 class InstrumentSection(Section):
@@ -151,12 +151,12 @@ class InstrumentSection(Section):
         if self.direction is not None:
             if self.gesture is None:
                 raise ValueError("direction needs gesture: that of a push points inwards, of a pull outwards")
-            rule, holds = _DIRECTIONS[self.gesture]
-            if not holds(*self.direction):
+            rule, is_allowed = _DIRECTIONS[self.gesture]
+            if not is_allowed(*self.direction):
                 raise ValueError(f"direction: a {self.gesture} {rule}")
         return self
 
-    def timed(self, frames: int, fps: float) -> InstrumentSection:
+    def scale_timing(self, frames: int, fps: float) -> InstrumentSection:
         """The same with times as parts of a sequence. ValueError, in the unit given, if it ends too late."""
         if self.timing is None:
             return self
@@ -168,7 +168,7 @@ class InstrumentSection(Section):
                 raise ValueError(f"timing: {numbers[3]:g} {what}")
             ends = f"{numbers[3]:g} {unit}, the sequence at {end:.4g} {unit}"
             raise ValueError(f"timing ends at {ends}: release earlier, or raise frames")
-        return self.model_copy(update={"timing": tuple(one / end for one in numbers)})
+        return self.model_copy(update={"timing": tuple(number / end for number in numbers)})
 
 
 class MembraneSection(Section):
@@ -207,7 +207,7 @@ Contacts = Annotated[tuple[Contact, ...], Field(min_length=1), _OneOrMore]
 Skulls = Annotated[tuple[Literal["bonded", "slip"], ...], Field(min_length=1), _OneOrMore]
 
 
-def _of_tissue(young_kpa: tuple[float, float]) -> tuple[float, float]:
+def _check_young(young_kpa: tuple[float, float]) -> tuple[float, float]:
     for value in young_kpa:
         if not 0.01 <= value <= 300:
             unit, factor = ("Pa", 1e-3) if value > 1 else ("MPa", 1e3)
@@ -215,7 +215,7 @@ def _of_tissue(young_kpa: tuple[float, float]) -> tuple[float, float]:
     return young_kpa
 
 
-def _of_ogden(alpha: tuple[float, float]) -> tuple[float, float]:
+def _check_alpha(alpha: tuple[float, float]) -> tuple[float, float]:
     if not -40 <= alpha[0] <= alpha[1] <= 40 or alpha[0] <= 0 <= alpha[1]:
         raise ValueError("both ends must be below 0, at least -40, or both above 0, at most 40")
     return alpha
@@ -228,12 +228,12 @@ class FemSection(Section):
     """Material law: linear, corotational, neo-hookean, ogden, which stiffens, or that of an installed
     plug-in; auto selects the cheapest built-in one whose error relative to neo-Hookean at the largest load is
     within 5%, and ogden for driven contacts."""
-    alpha: Annotated[Range[FiniteFloat], AfterValidator(_of_ogden)] = (-4.7, -4.7)
+    alpha: Annotated[Range[FiniteFloat], AfterValidator(_check_alpha)] = (-4.7, -4.7)
     """Exponent of law ogden, drawn uniformly. Swine: -4.7 (Miller & Chinzei, J. Biomech. 35, 2002); human
     about -20 (Budday et al., Acta Biomater. 48, 2017; Bennion et al., J. R. Soc. Interface, 2022)."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
     """Target number of quadratic tetrahedra; graded towards the craniotomy."""
-    young_kpa: Annotated[Range[Positive], AfterValidator(_of_tissue)] = (0.5, 3.0)
+    young_kpa: Annotated[Range[Positive], AfterValidator(_check_young)] = (0.5, 3.0)
     """Young's modulus E [kPa], drawn log-uniformly."""
     poisson: Range[Annotated[FiniteFloat, Field(ge=0, lt=0.5)]] = (0.4, 0.4)
     """Poisson's ratio, drawn uniformly. Brain within seconds of a load: 0.45 to nearly 0.5; drained: less."""
@@ -291,42 +291,42 @@ class FemSection(Section):
 
     @model_validator(mode="after")
     def _contacts_are_loaded_or_driven(self) -> FemSection:
-        named = [(f"instrument_list[{k}].", one) for k, one in enumerate(self.instrument_list)]
+        labelled = [(f"instrument_list[{k}].", line) for k, line in enumerate(self.instrument_list)]
         if "driven" not in self.contact:
-            ways = [("", self.travel_mm), *((at, one.travel_mm) for at, one in named)]
-            for at, way in ways:
-                if way is not None:
-                    raise ValueError(f"{at}travel_mm needs contact: driven")
+            travels = [("", self.travel_mm), *((label, line.travel_mm) for label, line in labelled)]
+            for label, travel_mm in travels:
+                if travel_mm is not None:
+                    raise ValueError(f"{label}travel_mm needs contact: driven")
             return self
         if self.time == "dynamic":
             raise ValueError("contact: driven needs time: quasi-static")
         slides = "gestures" in self.model_fields_set and "slide" in self.gestures
-        mixed = "loaded" in self.contact
-        if slides and (not mixed or {*self.gestures} == {"slide"}):
+        has_both = "loaded" in self.contact
+        if slides and (not has_both or {*self.gestures} == {"slide"}):
             raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
-        for at, instrument in named:
-            if instrument.gesture == "slide":
-                raise ValueError(f"{at}gesture: a driven contact holds the tissue and doesn't slide")
-        if mixed:
+        for label, line in labelled:
+            if line.gesture == "slide":
+                raise ValueError(f"{label}gesture: a driven contact holds the tissue and doesn't slide")
+        if has_both:
             if self.travel_mm is None:
                 raise ValueError("travel_mm: driven contacts next to loaded ones need it")
             return self
         if self.travel_mm is not None and self.force_mn is not None:
             raise ValueError("travel_mm: either the way or force_mn, not both")
         general = self.travel_mm or self.force_mn
-        if self.instruments[1] > len(named) and general is None:
+        if self.instruments[1] > len(labelled) and general is None:
             raise ValueError("travel_mm: a driven contact needs travel_mm or force_mn")
-        for at, one in named:
-            if not (one.travel_mm or one.force_mn or general) or one.load is not None:
-                raise ValueError(f"{at}travel_mm: a driven contact needs travel_mm or force_mn")
+        for label, line in labelled:
+            if not (line.travel_mm or line.force_mn or general) or line.load is not None:
+                raise ValueError(f"{label}travel_mm: a driven contact needs travel_mm or force_mn")
         return self
 
     @model_validator(mode="after")
     def _law_bears_loads_and_relaxation(self, info: ValidationInfo) -> FemSection:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the lost shares add up to the whole stiffness or more")
-        checked = info.context is not STORED and "loaded" in self.contact
-        for name, loads in self.load_ranges if checked else ():
+        is_checked = info.context is not STORED and "loaded" in self.contact
+        for name, loads in self.load_ranges if is_checked else ():
             check_load_range(self.of_contact("loaded").chosen_law[0], loads, self.young_kpa[0], name)
         return self
 
@@ -334,14 +334,14 @@ class FemSection(Section):
     def _gestures_take_their_instruments(self) -> FemSection:
         if "gestures" not in self.model_fields_set:
             object.__setattr__(self, "gestures", tuple(self.choices()))
-        lacking = [("instrument", kind) for kind in self.gestures if kind not in self.choices()]
-        for k, one in enumerate(self.instrument_list):
-            kinds = self.gestures if one.gesture is None else (one.gesture,)
-            at = "instrument" if one.instrument is None else f"instrument_list[{k}].instrument"
-            lacking += [] if self.choices(one) else [(at, kind) for kind in kinds]
-        if lacking:
-            takes = [f"{at}: a {kind} takes {' or '.join(INSTRUMENTS[kind])}" for at, kind in lacking]
-            raise ValueError("; ".join(dict.fromkeys(takes)))
+        misfits = [("instrument", kind) for kind in self.gestures if kind not in self.choices()]
+        for k, line in enumerate(self.instrument_list):
+            kinds = self.gestures if line.gesture is None else (line.gesture,)
+            key = "instrument" if line.instrument is None else f"instrument_list[{k}].instrument"
+            misfits += [] if self.choices(line) else [(key, kind) for kind in kinds]
+        if misfits:
+            messages = [f"{key}: a {kind} takes {' or '.join(INSTRUMENTS[kind])}" for key, kind in misfits]
+            raise ValueError("; ".join(dict.fromkeys(messages)))
         return self
 
     @property
@@ -358,32 +358,34 @@ class FemSection(Section):
                 raise ValueError(f"instrument: two are called {name_of(tool)}; rename one's file")
         return meshes
 
-    def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Tool, float]]:
+    def choices(self, line: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Tool, float]]:
         """Gestures that an instrument may be drawn with, each with its instruments and their shares."""
-        named = self.instrument if one.instrument is None else (one.instrument,)
-        found: dict[Kind, dict[Tool, float]] = {}
-        for kind in self.gestures if one.gesture is None else (one.gesture,):
+        tools = self.instrument if line.instrument is None else (line.instrument,)
+        shares_of: dict[Kind, dict[Tool, float]] = {}
+        for kind in self.gestures if line.gesture is None else (line.gesture,):
             shares: dict[Tool, float] = {name: share for name, share in INSTRUMENTS[kind].items()}
-            if named:
-                takes = {*shares, "none", *(() if kind == "grasp" else self.own_instruments.values())}
-                shares = {name: float(named.count(name)) for name in named if name in takes}
+            if tools:
+                suitable = {*shares, "none", *(() if kind == "grasp" else self.own_instruments.values())}
+                shares = {name: float(tools.count(name)) for name in tools if name in suitable}
             total = sum(shares.values())
-            found[kind] = {name: share / total for name, share in shares.items() if share}
+            shares_of[kind] = {name: share / total for name, share in shares.items() if share}
         if "loaded" not in self.contact:
-            found.pop("slide", None)
-        return {kind: shares for kind, shares in found.items() if shares}
+            shares_of.pop("slide", None)
+        return {kind: shares for kind, shares in shares_of.items() if shares}
 
     def load_range(self, instrument: InstrumentSection) -> LoadRange:
         """The ranges for an instrument: its own where it has some."""
-        own = instrument if instrument.load or instrument.force_mn else self
-        return LoadRange(own.load or self.load, own.force_mn, instrument.footprint_mm or self.footprint_mm)
+        source = instrument if instrument.load or instrument.force_mn else self
+        return LoadRange(
+            source.load or self.load, source.force_mn, instrument.footprint_mm or self.footprint_mm
+        )
 
     @property
     def load_ranges(self) -> list[tuple[str, LoadRange]]:
         """Ranges of instruments that are drawn freely, and of each in `instrument_list`, by label."""
-        given = self.instrument_list
-        drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(given) else []
-        return drawn + [(f"instrument_list[{k}]: ", self.load_range(one)) for k, one in enumerate(given)]
+        lines = self.instrument_list
+        ranges = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(lines) else []
+        return ranges + [(f"instrument_list[{k}]: ", self.load_range(line)) for k, line in enumerate(lines)]
 
     def of_contact(self, contact: Contact) -> FemSection:
         """The section of the sequences with one kind of contact.
@@ -394,9 +396,9 @@ class FemSection(Section):
         changes: dict[str, Any] = {"contact": (contact,)}
         if len({*self.contact}) > 1:
             left_out = ("travel_mm",) if contact == "loaded" else ("force_mn", "load")
-            kept = {key: None for key in left_out}
-            listed = tuple(instrument.model_copy(update=kept) for instrument in self.instrument_list)
-            changes |= {"instrument_list": listed}
+            cleared = {key: None for key in left_out}
+            lines = tuple(instrument.model_copy(update=cleared) for instrument in self.instrument_list)
+            changes |= {"instrument_list": lines}
             if contact == "driven":
                 changes |= {"force_mn": None}
         return self.model_copy(update=changes)

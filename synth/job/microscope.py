@@ -97,11 +97,14 @@ class RenderSection(Section):
     def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:
         if self.calibration is None or info.context is STORED:
             return self
-        found = round(camera_file.find_baseline_mm(self.calibration), 9)
-        for name in ("field_mm", "distortion", *(["stereo_mm"] if found else [])):
-            usual = type(self).model_fields[name].default, found  # a stored job has that of its calibration
-            if getattr(self, name) not in usual:
+        baseline_mm = round(camera_file.find_baseline_mm(self.calibration), 9)
+        for name in ("field_mm", "distortion", *(["stereo_mm"] if baseline_mm else [])):
+            defaults = (
+                type(self).model_fields[name].default,
+                baseline_mm,
+            )  # a stored job has that of its calibration
+            if getattr(self, name) not in defaults:
                 raise ValueError(f"{name}: render.calibration sets it; leave one of the two out")
-        if found:
-            object.__setattr__(self, "stereo_mm", found)
+        if baseline_mm:
+            object.__setattr__(self, "stereo_mm", baseline_mm)
         return self

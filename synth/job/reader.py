@@ -50,8 +50,8 @@ def read_source(source: str) -> tuple[str, str, Path]:
         return text, source, Path(source).resolve().parent
     if source not in names():
         # All but the training data of the pretrained networks.
-        shown = [name for name in names() if name != "mission"]
-        hint = did_you_mean(source, names()) or f", and no named job ({', '.join(shown)})"
+        examples = [name for name in names() if name != "mission"]
+        hint = did_you_mean(source, names()) or f", and no named job ({', '.join(examples)})"
         raise UserError(f"{source[:80]}: no such file{hint}")
     text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
     return text, f"{source} (a named job)", Path.cwd()
@@ -67,29 +67,29 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
     """Makes the paths in a job absolute; yields the errors of those that can't be used."""
     places: list[tuple[Loc, int | None]] = [*identity.FILES.items(), (("mechanics", "source"), None)]
-    places += [(at, checked_file.LARGEST_INSTRUMENT) for at in identity.find_meshes(config.values)]
-    for at, largest in places:
-        block = _inside(config.values, at[:-1])
-        name = _inside(block, at[-1:])
+    places += [(place, checked_file.LARGEST_INSTRUMENT) for place in identity.find_meshes(config.values)]
+    for place, largest in places:
+        block = _look_up(config.values, place[:-1])
+        name = _look_up(block, place[-1:])
         if not isinstance(name, str):
             continue
-        given = any(at[: len(change)] == change for change in config.changes)
+        overridden = any(place[: len(change)] == change for change in config.changes)
         try:
-            path = ((Path.cwd() if given else folder) / Path(name).expanduser()).resolve()
-            if at == ("appearance", "photo") and path.is_dir():
+            path = ((Path.cwd() if overridden else folder) / Path(name).expanduser()).resolve()
+            if place == ("appearance", "photo") and path.is_dir():
                 identity.list_pictures(path)
             elif largest is not None:  # else a pattern, or a folder
                 checked_file.check_file(path, largest)
-            block[at[-1]] = str(path)
+            block[place[-1]] = str(path)
         except UserError as error:
-            yield Mistake(at, str(error))
+            yield Mistake(place, str(error))
         except (RuntimeError, ValueError, OSError):  # no such home, a NUL, a loop of links, too long
-            yield Mistake(at, f"{name[:80]!r} is not a valid path")
+            yield Mistake(place, f"{name[:80]!r} is not a valid path")
 
 
-def _inside(values: Any, at: Loc) -> Any:
+def _look_up(values: Any, place: Loc) -> Any:
     """The value at a place in blocks and lists; None if there is none."""
-    for step in at:
+    for step in place:
         try:
             values = values[step]
         except (KeyError, IndexError, TypeError):

@@ -98,13 +98,13 @@ class AnatomySection(Section):
             raise ValueError("craniotomy.also needs a mesh; a procedural block is opened in its centre")
         return self
 
-    def opened(self, index: int) -> AnatomySection:
+    def select_opening(self, index: int) -> AnatomySection:
         """The section with only the craniotomy of sequence `index`."""
-        where = self.craniotomy
-        places: tuple[CraniotomySection | PlaceSection, ...] = (where, *where.also)
+        craniotomy = self.craniotomy
+        places: tuple[CraniotomySection | PlaceSection, ...] = (craniotomy, *craniotomy.also)
         place = places[index % len(places)]
-        moved = {"point": place.point, "direction": place.direction, "also": ()}
-        return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
+        changes = {"point": place.point, "direction": place.direction, "also": ()}
+        return self.model_copy(update={"craniotomy": craniotomy.model_copy(update=changes)})
 
 
 class MechanicsSection(Section):
@@ -193,7 +193,7 @@ _WITH_SERIES = {"young_kpa", "poisson", "footprint_mm", "instrument"}
 """Keys of `fem` that mean something where another program's files hold the motion."""
 
 
-def _changed(section: Section) -> set[str]:
+def _list_changed(section: Section) -> set[str]:
     """Keys of a section with other values than by default."""
     fields = type(section).model_fields.items()
     return {key for key, field in fields if getattr(section, key) != field.default}
@@ -233,8 +233,8 @@ class Job(Section):
     def _surface_and_fields_suit_the_picture(self) -> Job:
         if "vertices" not in self.anatomy.model_fields_set:
             width, height = self.render.size
-            fine = min(max(width * height // 4, 6000), self.anatomy.vertices)
-            anatomy = self.anatomy.model_copy(update={"vertices": fine})
+            vertices = min(max(width * height // 4, 6000), self.anatomy.vertices)
+            anatomy = self.anatomy.model_copy(update={"vertices": vertices})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
         fixed = self.anatomy.mesh, self.mechanics.source, self.render.calibration, self.fem.instrument_list
@@ -251,21 +251,23 @@ class Job(Section):
     @model_validator(mode="after")
     def _mechanics_are_ours_or_not(self) -> Job:
         if self.mechanics.source is None:
-            if used := _changed(self.mechanics):
+            if used := _list_changed(self.mechanics):
                 raise ValueError(f"mechanics.{min(used)} needs mechanics.source")
             return self
-        where = self.anatomy.craniotomy
-        if where.point is None or where.direction is None or self.anatomy.mesh is not None:
+        craniotomy = self.anatomy.craniotomy
+        if craniotomy.point is None or craniotomy.direction is None or self.anatomy.mesh is not None:
             raise ValueError("mechanics.source needs craniotomy.point and direction, and no anatomy.mesh")
         if self.mechanics.force is None and (labels := {"intensity", "flow_noisy"} & set(self.store.extra)):
             raise ValueError(f"store.extra: {min(labels)} needs mechanics.force")
-        if lost := _changed(self.anatomy) & {"fill_holes", "dome_mm", "attachments"}:
+        if lost := _list_changed(self.anatomy) & {"fill_holes", "dome_mm", "attachments"}:
             raise ValueError(
                 f"anatomy.{min(lost)} is not used: the files of mechanics.source hold the motion"
             )
-        usual = FemSection(instrument=self.fem.instrument)  # whose gestures are those of the instruments
-        derived = {"gestures"} if self.fem.gestures == usual.gestures else set[str]()
-        if unused := _changed(self.fem) - _WITH_SERIES - derived:
+        default_fem = FemSection(
+            instrument=self.fem.instrument
+        )  # whose gestures are those of the instruments
+        derived = {"gestures"} if self.fem.gestures == default_fem.gestures else set[str]()
+        if unused := _list_changed(self.fem) - _WITH_SERIES - derived:
             raise ValueError(f"fem.{min(unused)} is not used: the files of mechanics.source hold the motion")
         if self.mechanics.force is not None and self.fem.young_kpa[0] != self.fem.young_kpa[1]:
             raise ValueError("mechanics.force needs one value of fem.young_kpa, that of the files' tissue")
@@ -273,23 +275,26 @@ class Job(Section):
 
     @model_validator(mode="after")
     def _instruments_fit_opening_and_sequence(self, info: ValidationInfo) -> Job:
-        radius, timed = self.anatomy.craniotomy.radius_mm, []
+        radius, lines = self.anatomy.craniotomy.radius_mm, []
         for name, loads in () if info.context is STORED else self.fem.load_ranges:
-            if (least := loads.footprint_mm[0]) > radius:
+            if (footprint_mm := loads.footprint_mm[0]) > radius:
                 key = f"fem.{name.replace(': ', '.')}footprint_mm"
-                raise ValueError(f"{key}: {least:g} mm is wider than an opening of {radius:g} mm radius")
-        for k, one in enumerate(self.fem.instrument_list):
+                raise ValueError(
+                    f"{key}: {footprint_mm:g} mm is wider than an opening of {radius:g} mm radius"
+                )
+        for k, line in enumerate(self.fem.instrument_list):
             try:
-                timed.append(one.timed(self.frames, self.fps))
+                lines.append(line.scale_timing(self.frames, self.fps))
             except ValueError as error:
                 raise ValueError(f"fem.instrument_list[{k}].{error}") from None
-            least = self.fem.load_range(one).footprint_mm[0]
-            if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:
+            footprint_mm = self.fem.load_range(line).footprint_mm[0]
+            if line.place is not None and math.hypot(*line.place) + footprint_mm + CLEAR_MM > radius:
                 raise ValueError(
-                    f"fem.instrument_list[{k}].place: {math.hypot(*one.place):.3g} mm from the centre, a "
-                    f"contact of {least:g} mm radius reaches under the rim of an opening of {radius:g} mm"
+                    f"fem.instrument_list[{k}].place: {math.hypot(*line.place):.3g} mm from the centre, a "
+                    f"contact of {footprint_mm:g} mm radius reaches under the rim of an opening of "
+                    f"{radius:g} mm"
                 )
-        fem = self.fem.model_copy(update={"instrument_list": tuple(timed)})
+        fem = self.fem.model_copy(update={"instrument_list": tuple(lines)})
         object.__setattr__(self, "fem", fem)
         return self
 
@@ -302,5 +307,7 @@ class Job(Section):
         conditions = {"loaded": loaded, "several": several, "recovered": recovered, "stereo": stereo}
         kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
         kinds |= {"stereo recovered"} if stereo and recovered else set()
-        found = [one for one in FIELDS.values() if one.stored in kinds or one.name in self.store.extra]
-        return tuple(one.name for one in found if one.name not in self.store.without)
+        fields = [
+            field for field in FIELDS.values() if field.stored in kinds or field.name in self.store.extra
+        ]
+        return tuple(field.name for field in fields if field.name not in self.store.without)

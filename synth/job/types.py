@@ -21,25 +21,25 @@ def _pair(value: Any) -> Any:
     return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
         raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
     return value
 
 
-def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
+def _check_rising(value: tuple[float, ...]) -> tuple[float, ...]:
     if list(value) != sorted(value) or value[0] == value[-1]:
         raise ValueError("levels of a tone curve must rise")
     return value
 
 
-def _long(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _check_nonzero(value: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(value):
         raise ValueError("a direction must not be zero")
     return value
 
 
-Range = Annotated[tuple[Number, Number], BeforeValidator(_pair), AfterValidator(_ordered)]
+Range = Annotated[tuple[Number, Number], BeforeValidator(_pair), AfterValidator(_check_order)]
 """From the lower to the upper end; a single number is both."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -49,9 +49,9 @@ Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFlo
 _Weight = Annotated[FiniteFloat, Field(ge=-8, le=8)]
 Weights = tuple[_Weight, _Weight, _Weight]
 Curve = Annotated[
-    tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], AfterValidator(_rising)
+    tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], AfterValidator(_check_rising)
 ]
-Direction = Annotated[Vector, AfterValidator(_long)]
+Direction = Annotated[Vector, AfterValidator(_check_nonzero)]
 MembraneState = Literal["stripped", "unknown", "intact"]
 """Knowledge of the tissue's membrane (pia): removed, unknown, or present."""
 Scenery = Literal["retractor", "bone", "drape", "clips", "hooks", "patties"]
@@ -67,8 +67,10 @@ class Groups(dict[Group, float]):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Handler) -> Any:
-        known = handler(dict[Group, Share])
-        return no_info_after_validator_function(lambda got: cls({k: v for k, v in got.items() if v}), known)
+        schema = handler(dict[Group, Share])
+        return no_info_after_validator_function(
+            lambda groups: cls({k: v for k, v in groups.items() if v}), schema
+        )
 
 
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

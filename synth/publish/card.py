@@ -22,24 +22,24 @@ QUANTITIES = {column.name: column for column in index.COLUMNS if column.title}
 
 def write_card(folder: Folder) -> Path:
     """Writes README.md and its picture, from the index and the sequences. Returns its path."""
-    about = facts(folder, index.read_index(folder.root).to_pylist())
-    done, pictures = about["done"], folder.root / "card"
+    values = facts(folder, index.read_index(folder.root).to_pylist())
+    done, pictures = values["done"], folder.root / "card"
     pictures.mkdir(exist_ok=True)
-    best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
+    example = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
     attrs, fields = dict[str, Any](), list(FIELDS)
-    if best is not None:
+    if example is not None:
         from PIL import Image
 
-        sequence = open_sequence(location.store(folder.root, best["index"]))
+        sequence = open_sequence(location.store(folder.root, example["index"]))
         attrs, fields = sequence.attrs, sequence.fields
-        drawn = picture.draw_sequence(sequence, [picture.strongest(sequence)])
-        Image.fromarray(drawn).save(pictures / "example.png")
+        image = picture.draw_sequence(sequence, [picture.find_strongest(sequence)])
+        Image.fromarray(image).save(pictures / "example.png")
     text = template("card.md.jinja").render(
-        **about,
-        example=best,
+        **values,
+        example=example,
         variant=attrs.get("variant", "-"),
         versions=attrs.get("versions", {}),
-        ranges=[_range(done, one) for one in QUANTITIES.values()],
+        ranges=[_range(done, quantity) for quantity in QUANTITIES.values()],
         fields=[FIELDS[name] for name in fields],
         columns=index.COLUMNS,
     )
@@ -51,13 +51,13 @@ def write_card(folder: Folder) -> Path:
 def facts(folder: Folder, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Values for the templates of all descriptions, from the dataset's job and the rows of an index."""
     job = folder.job()
-    described, stored = folder.described(), sequence_split.read_stored(folder.root)
+    description, split = folder.read_description(), sequence_split.read_stored(folder.root)
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]
     reasons = Counter(row["reason"] for row in failed)
     first = {row["reason"]: row["index"] for row in reversed(failed)}
     limits = template("limits.jinja").render(
-        job=job, versions=len(described["generators"]), shared=stored.share_anatomy
+        job=job, versions=len(description["generators"]), shared=split.share_anatomy
     )
     return {
         "job": job,
@@ -70,9 +70,9 @@ def facts(folder: Folder, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "families": share(done, "family"),
         "gestures": share(done, "gesture"),
         "splits": share(done, "split"),
-        "split_hash": stored.hash,
+        "split_hash": split.hash,
         "cpu_h": column(done, "cpu_s").sum() / 3600,
-        "identity": described["identity"],
+        "identity": description["identity"],
         "dataset_hash": index.dataset_hash(rows),
         "limits": [line for line in limits.splitlines() if line],
     }

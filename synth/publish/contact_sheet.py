@@ -30,16 +30,16 @@ def draw_sheet(job: Job, count: int, report: ProgressCallback) -> Rgb:
     Each is drawn just before its load, or those of `mechanics.source` under their largest. Wide pictures are
     drawn smaller, with fewer vertices. UserError: an impossible job.
     """
-    chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
+    indices = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
     width, height = job.render.size
     share = min(1.0, TILE_PX / width)
-    small = (max(16, round(width * share)), max(16, round(height * share)))
+    tile_size = (max(16, round(width * share)), max(16, round(height * share)))
     vertices = max(round(job.anatomy.vertices * share**2), min(job.anatomy.vertices, _LEAST_VERTICES))
-    quick = job.model_copy(update={"anatomy": job.anatomy.model_copy(update={"vertices": vertices})})
+    coarse_job = job.model_copy(update={"anatomy": job.anatomy.model_copy(update={"vertices": vertices})})
     tiles = []
-    for done, index in enumerate(chosen):
-        report(done, len(chosen))
-        tiles.append(_draw_scenario(quick, index, small))
+    for position, index in enumerate(indices):
+        report(position, len(indices))
+        tiles.append(_draw_scenario(coarse_job, index, tile_size))
     return tile(tiles)
 
 
@@ -51,19 +51,19 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
         state = replace(deformed.state(deformed.strongest), camera=None)
     else:
         scene = at_rest(job, index)
-        ready = [pose_touching(gesture, scene.surface) for gesture in scene.scenario.gestures]
-        touching = (np.concatenate(part) for part in zip(*ready, strict=True))
-        tips, shafts = with_idle(scene.scenario.idle, 0.0, *touching)
+        poses = [pose_touching(gesture, scene.surface) for gesture in scene.scenario.gestures]
+        stacks = (np.concatenate(part) for part in zip(*poses, strict=True))
+        tips, shafts = with_idle(scene.scenario.idle, 0.0, *stacks)
         state = SceneState(scene.surface.vertices, tips, shafts)
-    sensor, part = scene.scenario.appearance.sensor, size[0] / job.render.size[0]
-    sensor = replace(sensor, blur=part * sensor.blur)  # which is in px of the whole picture
+    sensor, ratio = scene.scenario.appearance.sensor, size[0] / job.render.size[0]
+    sensor = replace(sensor, blur=ratio * sensor.blur)  # which is in px of the whole picture
     case = replace(scene.scenario, appearance=replace(scene.scenario.appearance, sensor=sensor))
-    drawn = replace(scene.draw, camera=resize(scene.view, size), scenario=case)
-    scene = replace(scene, draw=drawn)
-    frame = scene.renderer.render(state, drawn.frame_seeds[0])
+    scaled_draw = replace(scene.draw, camera=resize(scene.view, size), scenario=case)
+    scene = replace(scene, draw=scaled_draw)
+    frame = scene.renderer.render(state, scaled_draw.frame_seeds[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
-    acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")
-    return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
+    names = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")
+    return caption(picture, f"{index}  {scene.scenario.family}  {names}", size[1] - 8)
 
 
 def pose_touching(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:

@@ -52,30 +52,34 @@ def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = F
 
     UserError: the file cannot be used, or no opening of that radius works.
     """
-    chosen: list[Opening] = []
+    openings: list[Opening] = []
     why = "the surface is too small or too steep"
-    for one in sorted(_judged(mesh, radius_mm, fill_holes), key=lambda one: (one.flat, one.relief_mm)):
-        if any(np.linalg.norm(one.point - other.point) < _APART * radius_mm for other in chosen):
+    for opening in sorted(
+        _sample_openings(mesh, radius_mm, fill_holes), key=lambda opening: (opening.flat, opening.relief_mm)
+    ):
+        if any(np.linalg.norm(opening.point - other.point) < _APART * radius_mm for other in openings):
             continue
-        where = one.craniotomy(radius_mm)
-        section = AnatomySection(mesh=mesh.resolve(), fill_holes=fill_holes, vertices=2500, craniotomy=where)
+        craniotomy = opening.craniotomy(radius_mm)
+        section = AnatomySection(
+            mesh=mesh.resolve(), fill_holes=fill_holes, vertices=2500, craniotomy=craniotomy
+        )
         job = Job(anatomy=section, fem=FemSection(tets=400))  # a coarse mesh, to test whether it is possible
         try:
             build_volume(at_rest(job))
         except UserError as error:
             why = str(error)
             continue
-        chosen.append(one)
-        if len(chosen) == count:
+        openings.append(opening)
+        if len(openings) == count:
             break
-    if not chosen:
+    if not openings:
         raise UserError(f"{mesh.name}: no opening of {radius_mm:g} mm radius works ({why}); reduce --radius")
-    return chosen
+    return openings
 
 
-def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False) -> str:
+def as_job(mesh: Path, openings: Sequence[Opening], radius_mm: float, fill_holes: bool = False) -> str:
     """Lines of a job with the first opening, and the others as a comment below `also`."""
-    first, *others = (one.craniotomy(radius_mm).model_dump(mode="json") for one in chosen)
+    first, *others = (opening.craniotomy(radius_mm).model_dump(mode="json") for opening in openings)
     lines = [
         "anatomy:",
         f"  mesh: {job_writer.scalar(mesh)}",
@@ -84,11 +88,13 @@ def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: 
     lines += ["  craniotomy:", f"    radius_mm: {radius_mm:g}"]
     lines += [f"    point: {first['point']}", f"    direction: {first['direction']}"]
     lines += ["    # also:  # the next best; sequences use them in turn"] if others else []
-    lines += [f"    #   - {{point: {one['point']}, direction: {one['direction']}}}" for one in others]
+    lines += [
+        f"    #   - {{point: {section['point']}, direction: {section['direction']}}}" for section in others
+    ]
     return "\n".join(lines)
 
 
-def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool) -> Pixels:
+def draw_openings(mesh: Path, openings: Sequence[Opening], radius_mm: float, fill_holes: bool) -> Pixels:
     """Picture (H, W, 3) of the brain from six sides, with the outline and number (from 1) of each opening."""
     vertices, faces = read_brain(mesh, fill_holes)
     corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2
@@ -99,20 +105,22 @@ def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_
     circle = radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     tiles = []
     for side in (*np.eye(3), *-np.eye(3)):
-        flat = axes(side)[:2].T * [scale, -scale]
+        projection = axes(side)[:2].T * [scale, -scale]
 
-        def pixel(where: Floats, flat: Floats = flat) -> Indices:
-            return np.asarray(np.rint((where - middle) @ flat + _TILE_PX / 2), np.int32)
+        def pixel(points: Floats, projection: Floats = projection) -> Indices:
+            return np.asarray(np.rint((points - middle) @ projection + _TILE_PX / 2), np.int32)
 
         tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
         order = np.argsort(corners.mean(axis=1) @ side)  # back to front
         shade = 60 + 170 * np.abs(normal @ side)[order]
         for triangle, grey in zip(pixel(corners[order]), shade.tolist(), strict=True):
             cv2.fillConvexPoly(tile, triangle, (grey, 0.85 * grey, 0.8 * grey))
-        for number, one in enumerate(chosen, 1):
-            if one.direction @ side > 0.15:  # facing this side
-                cv2.polylines(tile, [pixel(one.point + circle @ axes(one.direction)[:2])], True, _BLUE, 2)
-                x, y = pixel(one.point).tolist()
+        for number, opening in enumerate(openings, 1):
+            if opening.direction @ side > 0.15:  # facing this side
+                cv2.polylines(
+                    tile, [pixel(opening.point + circle @ axes(opening.direction)[:2])], True, _BLUE, 2
+                )
+                x, y = pixel(opening.point).tolist()
                 cv2.putText(tile, str(number), (x - 6, y + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _BLUE, 2)
         name = f"from {'-' if side.min() < 0 else ''}{'xyz'[int(np.abs(side).argmax())]}"
         cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255))
@@ -120,7 +128,7 @@ def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_
     return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
 
 
-def _judged(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]:
+def _sample_openings(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]:
     """Openings at random places close to the convex hull, which approximates the skull."""
     import trimesh  # here, as most jobs have no mesh
 
@@ -129,46 +137,46 @@ def _judged(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]
     points = np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0])  # in random order
     planes = np.unique(np.round(ConvexHull(points).equations, 9), axis=0)
     places = points[: 20 * _PLACES]
-    above = places @ planes[:, :3].T + planes[:, 3]
+    heights = places @ planes[:, :3].T + planes[:, 3]
     tree = cKDTree(points)
-    for k in np.flatnonzero(above.max(axis=1) > -_UNDER_SKULL_MM)[:_PLACES]:
-        found = _judge(points, tree, places[k], planes[above[k].argmax(), :3], radius_mm)
-        if found is not None:
-            yield found
+    for k in np.flatnonzero(heights.max(axis=1) > -_UNDER_SKULL_MM)[:_PLACES]:
+        opening = _judge(points, tree, places[k], planes[heights[k].argmax(), :3], radius_mm)
+        if opening is not None:
+            yield opening
 
 
 def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm: float) -> Opening | None:
     """The opening at a point (3,) with an initial direction `out` (3,); None if it is not suitable."""
-    half = radius_mm + MARGIN_MM
-    near = points[tree.query_ball_point(point, 2.5 * half)]
-    for turned in (True, True, False):
+    half_mm = radius_mm + MARGIN_MM
+    neighbours = points[tree.query_ball_point(point, 2.5 * half_mm)]
+    for realigned in (True, True, False):
         turn = axes(out)
-        x, y, height = _height_map((near - point) @ turn.T, half)
+        x, y, height = _height_map((neighbours - point) @ turn.T, half_mm)
         inside = np.hypot(x, y) < radius_mm
-        there = inside & np.isfinite(height)
-        if there.sum() < 12:
+        covered = inside & np.isfinite(height)
+        if covered.sum() < 12:
             return None
-        x, y, z = x[there], y[there], height[there]
+        x, y, z = x[covered], y[covered], height[covered]
         plane = np.stack([np.ones_like(x), x, y], axis=1)
-        fitted = np.linalg.lstsq(plane, z, rcond=None)[0]
-        if turned:
-            out = np.array([-fitted[1], -fitted[2], 1.0]) @ turn
+        coefficients = np.linalg.lstsq(plane, z, rcond=None)[0]
+        if realigned:
+            out = np.array([-coefficients[1], -coefficients[2], 1.0]) @ turn
             out /= np.linalg.norm(out)
     dome = np.concatenate([plane, np.stack([x**2, x * y, y**2], axis=1)], axis=1)
     relief = float(np.std(z - dome @ np.linalg.lstsq(dome, z, rcond=None)[0]))
-    filled, share = np.isfinite(height).mean(), there.sum() / inside.sum()
+    filled, share = np.isfinite(height).mean(), covered.sum() / inside.sum()
     if filled < LEAST_FILLED or share < _LEAST_SURFACE or relief > _STEEPEST_MM:
         return None
     middle = point + z[np.hypot(x, y).argmin()] * turn[2]
-    return Opening(middle, out, relief, bool(np.median(np.abs(z - plane @ fitted)) < _FLAT * radius_mm))
+    return Opening(middle, out, relief, bool(np.median(np.abs(z - plane @ coefficients)) < _FLAT * radius_mm))
 
 
-def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
+def _height_map(points: Floats, half_mm: float) -> tuple[Floats, Floats, Floats]:
     """x, y and greatest height (n, n) mm in each pixel of a square, NaN without a point.
 
     Points deeper than 3/4 of the square's side are of the brain's far side, as in the renderer.
     """
-    across, down, up = placed[placed[:, 2] > -1.5 * half].T
-    edges = np.linspace(-half, half, 1 + int(np.ceil(2 * half / _PIXEL_MM)))
+    across, down, up = points[points[:, 2] > -1.5 * half_mm].T
+    edges = np.linspace(-half_mm, half_mm, 1 + int(np.ceil(2 * half_mm / _PIXEL_MM)))
     height = stats.binned_statistic_2d(down, across, up, "max", [edges, edges]).statistic
     return *np.meshgrid(*[(edges[1:] + edges[:-1]) / 2] * 2), height

@@ -41,9 +41,9 @@ def write_videos(
     if unknown := [name for name in overlays if name not in OVERLAYS]:
         raise UserError(f"{unknown[0]}: is not one of {', '.join(OVERLAYS)}")
     for sequence in dataset:
-        drawn = draw_video(sequence, overlays, interval_s)
+        frames = draw_video(sequence, overlays, interval_s)
         file = target / f"{sequence.index:06d}.mp4"
-        encode_video(file, drawn, float(sequence.attrs["fps"]), quality=_QUALITY)
+        encode_video(file, frames, float(sequence.attrs["fps"]), quality=_QUALITY)
 
 
 def draw_video(
@@ -55,36 +55,36 @@ def draw_video(
             raise UserError(f"{sequence.path}: holds no {OVERLAYS[name]}")
     time = sequence["time"][:]
     first, last = interval_s or (-np.inf, np.inf)
-    chosen = np.flatnonzero((time >= first) & (time <= last)).tolist()
-    if not chosen:
+    frames = np.flatnonzero((time >= first) & (time <= last)).tolist()
+    if not frames:
         raise UserError(f"{sequence.path}: has no frame between {first:g} and {last:g} s")
     largest = {
-        name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][t], axis=-1).max()) for t in chosen)
+        name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][t], axis=-1).max()) for t in frames)
         for name in overlays
     }
     tissue, curve = sequence["tissue"][:], None
-    for k, t in enumerate(chosen):
-        picture = _overlaid(sequence, t, tissue, largest) if overlays else sequence["rgb"][t]
+    for k, t in enumerate(frames):
+        picture = _draw_overlays(sequence, t, tissue, largest) if overlays else sequence["rgb"][t]
         if "force" in overlays:
             if curve is None:
                 force = np.linalg.norm(sequence["force"][:], axis=1)
-                curve = draw_curve(time[chosen], force[chosen], picture.shape[1])
-            picture = np.vstack([picture, mark(curve, k, len(chosen))])
+                curve = draw_curve(time[frames], force[frames], picture.shape[1])
+            picture = np.vstack([picture, mark(curve, k, len(frames))])
         yield picture
 
 
-def _overlaid(sequence: Sequence, t: int, tissue: Mask, largest: dict[str, float]) -> Rgb:
+def _draw_overlays(sequence: Sequence, t: int, tissue: Mask, largest: dict[str, float]) -> Rgb:
     picture, words = sequence["rgb"][t], [f"{sequence['time'][t]:.2f} s"]
     if "force" in largest:
         size = np.linalg.norm(sequence["traction"][t], axis=-1)
-        moved = warp_to_frame(np.where(tissue, size, 0.0), sequence["flow"][t])
-        picture = glow(picture, moved, largest["force"])
+        warped = warp_to_frame(np.where(tissue, size, 0.0), sequence["flow"][t])
+        picture = glow(picture, warped, largest["force"])
         words.append(f"{np.linalg.norm(sequence['force'][t]):.1f} mN (yellow: {largest['force']:.2g} kPa)")
     for name in (name for name in largest if name != "force"):
         gain = drawing.arrow_gain(sequence.size[1], largest[name])
         picture = drawing.arrows(picture, sequence[OVERLAYS[name]][t], tissue, gain)
         words.append(f"{OVERLAYS[name]} x{gain}")
-    return drawing.caption(drawing.legible(picture), "  ".join(words))
+    return drawing.caption(drawing.enlarge(picture), "  ".join(words))
 
 
 def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> Map:
@@ -92,10 +92,10 @@ def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> M
     height, width = values.shape
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
     flow = flow.astype(np.float32)
-    back = flow
+    inverse = flow
     for _ in range(_ITERATIONS):
-        back = cv2.remap(flow, columns - back[..., 0], rows - back[..., 1], cv2.INTER_LINEAR)
-    x, y = columns - back[..., 0], rows - back[..., 1]
+        inverse = cv2.remap(flow, columns - inverse[..., 0], rows - inverse[..., 1], cv2.INTER_LINEAR)
+    x, y = columns - inverse[..., 0], rows - inverse[..., 1]
     return np.asarray(cv2.remap(values.astype(np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
@@ -109,13 +109,13 @@ def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
 def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], width_px: int) -> Rgb:
     """A strip (h, width_px, 3) with force (T,) over time (T,), with gaps at NaN."""
     strip = np.full((_CURVE_PX, width_px, 3), 255, np.uint8)
-    sure = np.isfinite(force_mn)
-    top = max(float(force_mn[sure].max()), 1e-9) if sure.any() else 1.0
+    finite = np.isfinite(force_mn)
+    top = max(float(force_mn[finite].max()), 1e-9) if finite.any() else 1.0
     level = np.clip(np.nan_to_num(force_mn) / top, 0, 1)
     y = np.round((_CURVE_PX - 6) - level * (_CURVE_PX - 24)).astype(int)
-    places = np.stack([_columns(len(force_mn), width_px), y], axis=1).tolist()
-    for k in np.flatnonzero(sure[1:] & sure[:-1]):
-        cv2.line(strip, places[k], places[k + 1], _LINE, 1, cv2.LINE_AA)
+    points = np.stack([_columns(len(force_mn), width_px), y], axis=1).tolist()
+    for k in np.flatnonzero(finite[1:] & finite[:-1]):
+        cv2.line(strip, points[k], points[k + 1], _LINE, 1, cv2.LINE_AA)
     text = f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
     cv2.putText(strip, text, (_LEFT_PX, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, drawing.INK, 1, cv2.LINE_AA)
     return strip
@@ -123,9 +123,9 @@ def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], wid
 
 def mark(curve: Rgb, k: int, count: int) -> Rgb:
     """The strip (h, w, 3) with a cursor at the k-th of `count` values."""
-    marked = curve.copy()
-    marked[16:, _columns(count, curve.shape[1])[k]] = drawing.INK
-    return marked
+    strip = curve.copy()
+    strip[16:, _columns(count, curve.shape[1])[k]] = drawing.INK
+    return strip
 
 
 def _columns(count: int, width_px: int) -> Ints:

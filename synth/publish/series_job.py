@@ -9,7 +9,7 @@ import numpy as np
 from synth.arrays import Floats
 from synth.fem.external.read_series import read_series
 from synth.fem.external.series import MeshSeries, Units
-from synth.fem.external.vtk_series import MOVED
+from synth.fem.external.vtk_series import MOTION_NAMES
 from synth.fem.surface_embedding import vertex_area
 from synth.job import job_writer
 
@@ -21,9 +21,9 @@ _DT_S = 0.04  # written where files carry no time
 def as_job(source: Path) -> str:
     """The text of a job for the series in `source`. UserError: it can't be read."""
     series = read_series(source, Units(dt_s=_DT_S, guess=True))
-    point, direction, radius = _opening(series)
+    point, direction, radius = _find_opening(series)
     frames = max(3, min(len(series.time), 250))
-    named = [f"nodal:{name}, traction:{name}" for name in series.fields if name.lower() not in MOVED]
+    labels = [f"nodal:{name}, traction:{name}" for name in series.fields if name.lower() not in MOTION_NAMES]
     lines = [
         f"# {series.summary}.",
         *(f"# DOUBTFUL: {caution}" for caution in series.cautions),
@@ -37,7 +37,7 @@ def as_job(source: Path) -> str:
         f"  unit_mm: {series.unit_mm:g}  # from the size of the surface; is it right?",
         *([] if series.timed else [f"  dt_s: {_DT_S}  # PLEASE SET: the files state no time"]),
         "  # For a label, state the force on the surface from outside, its unit, and the tissue's stiffness:",
-        f"  # force: {', '.join([*named, 'or force.csv with time, fx, fy, fz, x, y, z'])}",
+        f"  # force: {', '.join([*labels, 'or force.csv with time, fx, fy, fz, x, y, z'])}",
         "  # unit_mn: 1000  # for N",
         "# fem: {young_kpa: 1.0, poisson: 0.45}",
         "anatomy:",
@@ -49,17 +49,18 @@ def as_job(source: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _opening(series: MeshSeries) -> tuple[Floats, Floats, float]:
+def _find_opening(series: MeshSeries) -> tuple[Floats, Floats, float]:
     """Point [mm], outward direction and radius [mm] of an opening where the surface moves most."""
     points = series.points
-    most = np.linalg.norm(series.displacement, axis=2).max(axis=0)
-    weight = vertex_area(points, series.faces) * (most > 0.7 * most.max())
+    peak_mm = np.linalg.norm(series.displacement, axis=2).max(axis=0)
+    weight = vertex_area(points, series.faces) * (peak_mm > 0.7 * peak_mm.max())
     middle = weight @ points / weight.sum()
     point = points[np.linalg.norm(points - middle, axis=1).argmin()]
     radius = min(_RADIUS_MM, 0.4 * float(np.sort(np.ptp(points, axis=0))[1]))
-    away = np.linalg.norm(points - point, axis=1)
-    near = np.argsort(away)[: max(12, int((away < radius / 2).sum()))]
+    distance_mm = np.linalg.norm(points - point, axis=1)
+    neighbours = np.argsort(distance_mm)[: max(12, int((distance_mm < radius / 2).sum()))]
     # The normal of their plane, as faces may be turned either way; outwards is away from the body's middle.
-    out = np.linalg.svd(points[near] - points[near].mean(axis=0))[2][2]
-    height = out @ (point - points.mean(axis=0))
-    return point, out if (height if abs(height) > _FLAT * radius else out.sum()) > 0 else -out, radius
+    normal = np.linalg.svd(points[neighbours] - points[neighbours].mean(axis=0))[2][2]
+    height = normal @ (point - points.mean(axis=0))
+    is_outwards = (height if abs(height) > _FLAT * radius else normal.sum()) > 0
+    return point, normal if is_outwards else -normal, radius

@@ -47,8 +47,8 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width / 72, height / 72), layout="constrained")
         draw(figure)
-        file, nothing = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        figure.savefig(file, format="svg", metadata=nothing)
+        file, metadata = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(file, format="svg", metadata=metadata)
     return _slim(file.getvalue())
 
 
@@ -60,8 +60,8 @@ def _slim(text: str) -> str:
     """
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' transform="rotate\(-0 [^"]*"|(?<=<g) id="[^"]*"', "", text)
-    short = partial(_LONG.sub, lambda number: f"{float(number[0]) + 0.0123:.1f}".removesuffix(".0"))
-    text = re.sub(r"<[^>]+>", lambda tag: short(tag[0]), text)
+    shorten = partial(_LONG.sub, lambda number: f"{float(number[0]) + 0.0123:.1f}".removesuffix(".0"))
+    text = re.sub(r"<[^>]+>", lambda tag: shorten(tag[0]), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     parts = dict.fromkeys(re.findall(r' id="(\w+)"', text))
     mark = f"{zlib.crc32(re.sub('|'.join(parts) or '$', '', text).encode()):x}"

@@ -42,9 +42,9 @@ def build_craniotomy(
     appearance: Appearance,
     camera: Camera,
     opening_mm: float,
-    drawn: Sequence[tuple[str, float]] = (),
+    tools: Sequence[tuple[str, float]] = (),
     idle: Sequence[IdleInstrument] = (),
-    how: Randomization | None = None,
+    randomization: Randomization | None = None,
     *,
     photo: Path | None = None,
     wear: float = 0.0,
@@ -52,87 +52,92 @@ def build_craniotomy(
 ) -> SceneContent:
     """The content of one sequence at rest; UserError: the photograph cannot be read.
 
-    `opening_mm`: radius of the opening; `drawn`: kind of each acting instrument, `none` for one that is not
-    drawn, and the radius of its contacts [mm]; `idle`: those that touch nothing; `how`: what is randomised;
-    `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their steel;
-    `meshes`: of kinds of one's own.
+    `opening_mm`: radius of the opening; `tools`: kind of each acting instrument, `none` for one that is not
+    drawn, and the radius of its contacts [mm]; `idle`: those that touch nothing; `randomization`: what is
+    randomised; `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their
+    steel; `meshes`: of kinds of one's own.
     """
-    how = how or Randomization()
-    lit = appearance.light.power * light.blackbody(appearance.light.kelvin)
-    ambient = appearance.light.ambient * lit
+    randomization = randomization or Randomization()
+    lamp_colour = appearance.light.power * light.blackbody(appearance.light.kelvin)
+    ambient = appearance.light.ambient * lamp_colour
     # Grown and painted in the usual size.
-    patch, px_mm = resize(surface, 1 / how.scale), camera.mm_per_px / how.scale
+    patch, px_mm = resize(surface, 1 / randomization.scale), camera.mm_per_px / randomization.scale
     seen_mm = _SEEN * 0.5 * float(np.hypot(*camera.size)) * px_mm
-    around = rim.build(patch, opening_mm / how.scale, appearance, px_mm, seen_mm)
+    opening_rim = rim.build(patch, opening_mm / randomization.scale, appearance, px_mm, seen_mm)
     lamps = light.lamps(camera, appearance.light)
     slopes = light.mirror_slopes(camera, lamps[0])
-    coat = _paint_cortex(patch, around, appearance, px_mm, slopes, how, photo)
-    roughness = appearance.roughness if how.pattern is None else how.pattern.roughness
+    coat = _paint_cortex(patch, opening_rim, appearance, px_mm, slopes, randomization, photo)
+    roughness = appearance.roughness if randomization.pattern is None else randomization.pattern.roughness
     cortex = Wet(coat, roughness, appearance.dry_roughness, ambient, appearance.fluid_index)
-    wound = _wound(patch, around, coat, appearance)
-    theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
-    if how.surroundings is None:
-        first = _build_rim(around, appearance, camera, px_mm, ambient, how.scale)
-        static = [first, *_place_scenery(around, appearance, camera, theatre, surface, first, how.scale)]
+    wound = _wound(patch, opening_rim, coat, appearance)
+    theatre = Theatre(wound, randomization.scale * patch.chart.extent_mm, lamp_colour, camera.centre)
+    if randomization.surroundings is None:
+        rim_body = _build_rim(opening_rim, appearance, camera, px_mm, ambient, randomization.scale)
+        static = [
+            rim_body,
+            *_place_scenery(opening_rim, appearance, camera, theatre, surface, rim_body, randomization.scale),
+        ]
     else:
         sizes = opening_mm, 2 * camera.mm_per_px * camera.size[0]
-        sheet = surroundings.sheet(how.surroundings, surface.vertices, *sizes, ambient)
-        static = [] if how.surroundings.kind == "nothing" else [sheet]
-    hand = np.random.default_rng([appearance.rim_seed, 2])
+        sheet = surroundings.sheet(randomization.surroundings, surface.vertices, *sizes, ambient)
+        static = [] if randomization.surroundings.kind == "nothing" else [sheet]
+    rng = np.random.default_rng([appearance.rim_seed, 2])
     ground = _gather_ground(surface, static[:1])
     # In the corners of the patch, farther under the rim than at its sides.
     corners = np.hypot(*surface.vertices[:, :2].T) > 0.5 * surface.extent_mm
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
-        hidden=corners[surface.faces].all(axis=1) if how.surroundings is None else None,
+        hidden=corners[surface.faces].all(axis=1) if randomization.surroundings is None else None,
         lamps=lamps,
         static=static,
-        instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),
+        instruments=instrument.build(tools, theatre, rng, wear, idle, ground, camera.mm_per_px, meshes),
         spot=appearance.light.even,
     )
 
 
 def _paint_cortex(
     patch: CortexSurface,
-    around: Rim,
+    opening_rim: Rim,
     appearance: Appearance,
     px_mm: float,
     slopes: tuple[float, float, float],
-    how: Randomization,
+    randomization: Randomization,
     photo: Path | None,
 ) -> Coat:
     """The maps of the tissue; `px_mm`: of a pixel on it, in the usual size; `slopes`: `mirror_slopes`."""
-    pixels = _count_texels(patch.chart.extent_mm, px_mm, how.scale)
-    if how.pattern is not None:
-        return pattern.paint(how.pattern, pixels, patch.chart.extent_mm)
+    pixels = _count_texels(patch.chart.extent_mm, px_mm, randomization.scale)
+    if randomization.pattern is not None:
+        return pattern.paint(randomization.pattern, pixels, patch.chart.extent_mm)
     x, y, rise = slopes
-    mirror = x, y, rise * how.scale
-    shade = rim.shade(around, patch) if how.surroundings is None else None
+    mirror = x, y, rise * randomization.scale
+    shade = rim.shade(opening_rim, patch) if randomization.surroundings is None else None
     paint = partial(texture.cortex, patch, appearance, pixels, photo, shade, mirror)
     coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade, mirror)
-    if how.tinted:
-        coat = replace(coat, albedo=pattern.tinted(coat.albedo, how.tint, how.tinted))
+    if randomization.tinted:
+        coat = replace(coat, albedo=pattern.apply_tint(coat.albedo, randomization.tint, randomization.tinted))
     return coat
 
 
 def _build_rim(
-    around: Rim, appearance: Appearance, camera: Camera, px_mm: float, ambient: Floats, scale: float
+    opening_rim: Rim, appearance: Appearance, camera: Camera, px_mm: float, ambient: Floats, scale: float
 ) -> Body:
     """The rim, painted only when it is first rendered: truth at rest needs no paint, which takes a second."""
-    texels = _count_texels(around.extent_mm, 2.2 * px_mm, scale)
-    seen = _seen(camera, around.extent_mm, scale)
-    paint = partial(rim.paint, around, appearance, texels, seen)
-    painted = partial(_COATS.get, paint, around, appearance, texels, seen)
+    texels = _count_texels(opening_rim.extent_mm, 2.2 * px_mm, scale)
+    visible_squares = _find_visible(camera, opening_rim.extent_mm, scale)
+    paint = partial(rim.paint, opening_rim, appearance, texels, visible_squares)
+    cached_paint = partial(_COATS.get, paint, opening_rim, appearance, texels, visible_squares)
     # Only faces that may be seen: all bodies' trees are made anew every frame.
-    column, row = np.clip((around.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
-    shown = seen[row, column][around.shape.faces].any(axis=1)
-    shown[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
-    finish = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
-    return Body(scale * around.shape.vertices, around.shape.faces[shown], around.uv, finish)
+    column, row = np.clip((opening_rim.uv * _SQUARES).astype(int), 0, _SQUARES - 1).T
+    visible_faces = visible_squares[row, column][opening_rim.shape.faces].any(axis=1)
+    visible_faces[:1] = True  # a mesh has a face, even if the picture shows tissue from edge to edge
+    finish = Wet(cached_paint, _RIM_ROUGHNESS, _RIM_DRY, ambient)
+    return Body(
+        scale * opening_rim.shape.vertices, opening_rim.shape.faces[visible_faces], opening_rim.uv, finish
+    )
 
 
 def _place_scenery(
-    around: Rim,
+    opening_rim: Rim,
     appearance: Appearance,
     camera: Camera,
     theatre: Theatre,
@@ -142,18 +147,20 @@ def _place_scenery(
 ) -> list[Body]:
     """What lies on the rim, `rim_body`: retractor, clips, drapes."""
     ground, seed = _gather_ground(surface, [rim_body]), appearance.rim_seed
-    placed: list[Body] = []
+    bodies: list[Body] = []
     if "retractor" in appearance.scenery:
-        placed.append(scenery.build_retractor(scale * around.edge, theatre, ground, seed, camera.mm_per_px))
-    for name, objects in scenery.ALONG_RIM.items():
+        bodies.append(
+            scenery.build_retractor(scale * opening_rim.edge, theatre, ground, seed, camera.mm_per_px)
+        )
+    for name, build_objects in scenery.ALONG_RIM.items():
         if name in appearance.scenery:
-            placed += objects(around, scale, theatre, ground, seed, camera)
-    return placed
+            bodies += build_objects(opening_rim, scale, theatre, ground, seed, camera)
+    return bodies
 
 
 def _gather_ground(surface: CortexSurface, bodies: Sequence[Body]) -> Floats:
     """Points (V, 3) mm of the tissue and what surrounds it, on which things lie."""
-    return np.concatenate([surface.vertices, *(one.vertices for one in bodies)])
+    return np.concatenate([surface.vertices, *(body.vertices for body in bodies)])
 
 
 def _count_texels(extent_mm: float, px_mm: float, scale: float) -> int:
@@ -161,24 +168,24 @@ def _count_texels(extent_mm: float, px_mm: float, scale: float) -> int:
     return min(texture.resolution(extent_mm, px_mm), _MOST_TEXELS if scale != 1 else 4096)
 
 
-def _seen(camera: Camera, extent_mm: float, scale: float) -> Mask:
+def _find_visible(camera: Camera, extent_mm: float, scale: float) -> Mask:
     """Whether squares (n, n) of the rim's map may be in the picture of the camera, wherever it moves."""
     axis = scale * noise.centres(_SQUARES, extent_mm)
     x, y = np.meshgrid(axis, axis)
     local = to_camera(camera, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, _RIM_MM)]))
     with np.errstate(all="ignore"):
-        plain = (local[:, :2] / local[:, 2:]) * np.diag(camera.K)[:2] + camera.K[:2, 2]
-        places = np.stack([plain, to_pixels(camera, local)])
+        undistorted = (local[:, :2] / local[:, 2:]) * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        places = np.stack([undistorted, to_pixels(camera, local)])
     size, margin = np.asarray(camera.size), (_SEEN - 1) * 0.5 * float(np.hypot(*camera.size))
     inside = (np.abs(places - 0.5 * size) < 0.5 * size + margin).all(axis=-1).any(axis=0)
     return np.asarray((inside | (local[:, 2] < 1)).reshape(x.shape))
 
 
-def _wound(surface: CortexSurface, around: Rim, coat: Coat, appearance: Appearance) -> Map:
+def _wound(surface: CortexSurface, opening_rim: Rim, coat: Coat, appearance: Appearance) -> Map:
     """Colour (n, n, 3) of the cortex with the rim around it, coarse, as steel mirrors it."""
-    small = cv2.resize(coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
+    albedo = cv2.resize(coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
     # The chart's extent is close enough to the projection's for the finish.
     axis = noise.centres(_MIRRORED_PX, surface.chart.extent_mm)
-    inside = rim.inside(around, *np.meshgrid(axis, axis))[..., None]
+    inside = rim.inside(opening_rim, *np.meshgrid(axis, axis))[..., None]
     outside = 0.5 * (np.asarray(appearance.dura_albedo) + np.asarray(appearance.surroundings_albedo))
-    return np.asarray(small * inside + outside.astype(np.float32) * (1 - inside), np.float32)
+    return np.asarray(albedo * inside + outside.astype(np.float32) * (1 - inside), np.float32)

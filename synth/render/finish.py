@@ -49,23 +49,29 @@ class Finish:
 
 def draw_finish(strength: float, rng: np.random.Generator, kind: str) -> Finish:
     """A finish of an instrument of that kind: of those in use, or with probability `strength` of any."""
-    wide, soft, colours = rng.random() < strength, kind in _SOFT, _SOFT.get(kind, SOLD)
+    any_finish, is_soft, colours = rng.random() < strength, kind in _SOFT, _SOFT.get(kind, SOLD)
     metal, coat = _METALS[rng.integers(len(_METALS))], colours[rng.integers(len(colours))]
-    if wide and kind not in CLOTH and rng.random() < 0.7:
+    if any_finish and kind not in CLOTH and rng.random() < 0.7:
         r, g, b = (rng.uniform(0.01, 0.9, 3 if rng.random() < 0.6 else 1) ** 2 * np.ones(3)).tolist()
         coat = r, g, b
-    coated = rng.random() < (0.6 if wide else _INSULATED.get(kind, 0.0))
+    has_coat = rng.random() < (0.6 if any_finish else _INSULATED.get(kind, 0.0))
     # From before its tip on: all of it, as paint or composite.
-    bare = -1.0 if soft else float(rng.choice((-1.0, *COATS_MM) if wide else COATS_MM)) if coated else np.inf
-    body = rng.choice(len(_ALPHAS), p=None if wide else _SHARES)
-    ranges = [_ALPHAS[body], (0.06, 0.15), (0.2, 0.5), (0.7, 1.0) if kind in CLOTH else _COAT_ALPHAS[soft]]
-    ranges += [(0, 1), (0.2, 1), (2, 30)] if wide else [(0, 0.15), (0.2, 0.7), (2, 7)]
-    alpha, scattered, brushed, coat_alpha, wear, blood, long = rng.uniform(*np.transpose(ranges)).tolist()
-    bloody = blood * (rng.random() < 0.6)
-    body_only = scattered * (body != 3), brushed * (body == 1)
-    wet = 0.0 if soft else float(rng.choice([1.5, 3.0, 5.0, 8.0]))
+    bare_mm = (
+        -1.0
+        if is_soft
+        else float(rng.choice((-1.0, *COATS_MM) if any_finish else COATS_MM))
+        if has_coat
+        else np.inf
+    )
+    body = rng.choice(len(_ALPHAS), p=None if any_finish else _SHARES)
+    ranges = [_ALPHAS[body], (0.06, 0.15), (0.2, 0.5), (0.7, 1.0) if kind in CLOTH else _COAT_ALPHAS[is_soft]]
+    ranges += [(0, 1), (0.2, 1), (2, 30)] if any_finish else [(0, 0.15), (0.2, 0.7), (2, 7)]
+    alpha, scattered, brushed, coat_alpha, wear, blood, blood_mm = rng.uniform(*np.transpose(ranges)).tolist()
+    blood_share = blood * (rng.random() < 0.6)
+    body_values = scattered * (body != 3), brushed * (body == 1)
+    wet_mm = 0.0 if is_soft else float(rng.choice([1.5, 3.0, 5.0, 8.0]))
     streak = _STREAKS[body]
     return Finish(
-        metal, alpha, streak, *body_only, coat, coat_alpha, 1.0 if soft else _COAT_STREAK, bare,
-        wear * (not soft), bloody, long, wet,
+        metal, alpha, streak, *body_values, coat, coat_alpha, 1.0 if is_soft else _COAT_STREAK, bare_mm,
+        wear * (not is_soft), blood_share, blood_mm, wet_mm,
     )  # fmt: skip

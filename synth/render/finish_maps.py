@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from synth.arrays import Floats, Indices, Map
-from synth.render.anatomy.layers import Rgb, over, ridge, step, through
+from synth.render.anatomy.layers import Rgb, attenuate, over, ridge, step
 from synth.render.finish import Finish
 from synth.render.idle import CLOTH
 from synth.render.materials import FinishMaps
@@ -79,9 +79,9 @@ def unfold(profile: Floats, turn: int) -> Map:
     `turn`: column of the texture's middle row.
     """
     rings = profile.reshape(-1, RING, 3)
-    aside = (np.arange(RING) - turn + RING // 2) % RING - RING // 2  # columns from the middle one
-    folded = np.where(np.abs(aside) > RING // 4, np.sign(aside) * RING // 2 - aside, aside)
-    across = np.tile(_share_of_outline(rings[:, _shown(turn)])[RING // 4 - folded], len(rings))
+    offsets = (np.arange(RING) - turn + RING // 2) % RING - RING // 2  # columns from the middle one
+    mirrored = np.where(np.abs(offsets) > RING // 4, np.sign(offsets) * RING // 2 - offsets, offsets)
+    across = np.tile(_share_of_outline(rings[:, _visible_columns(turn)])[RING // 4 - mirrored], len(rings))
     return np.column_stack([np.repeat(np.linspace(0, 1, len(rings)), RING), across]).astype(np.float32)
 
 
@@ -144,7 +144,7 @@ def paint(
     `turn`: as of `unfold`; `mm_per_px`: of the picture, as fine as which they are.
     """
     texels = _lay_out(profile, sheet_rows, turn, kind, rng, mm_per_px)
-    layers = _wetted(finish, texels, _bloodied(finish, texels, _body(finish, texels), rng), rng)
+    layers = _add_water(finish, texels, _add_blood(finish, texels, _body(finish, texels), rng), rng)
     base, mirror, bumps, rough = layers.base, layers.mirror, layers.bumps, np.clip(layers.rough, 0.05, 1)
     if kind in ("suction", "tube"):
         width = texels.along.shape[1]
@@ -174,183 +174,197 @@ def _lay_out(
         sides = np.abs(rings[..., :2])
         along = _texels((sides.max(axis=(0, 1)) - sides).min(axis=-1)[..., None], size)
     else:
-        shown = _shown(turn)
-        body = rings[len(rings) // 3, shown]
+        columns = _visible_columns(turn)
+        body = rings[len(rings) // 3, columns]
         outline = float(np.linalg.norm(np.diff(body, axis=0), axis=1).sum())
         height = int(np.clip(max(_WIDE_MM, 0.9 * outline) / mm_per_px, *_ACROSS))
         share, most = _BLADE_COLUMNS if kind == "spatula" else _COLUMNS
         size = height, min(share * height, most)
-        rows = np.interp(np.linspace(0, 1, height), _share_of_outline(rings[:, shown]), np.arange(len(shown)))
-        place = _texels(rings[:, shown].swapaxes(0, 1), size, rows)
-        turned = _texels(_edges(rings)[:, shown].T[..., None], size, rows)
+        rows = np.interp(
+            np.linspace(0, 1, height), _share_of_outline(rings[:, columns]), np.arange(len(columns))
+        )
+        place = _texels(rings[:, columns].swapaxes(0, 1), size, rows)
+        turned = _texels(_edges(rings)[:, columns].T[..., None], size, rows)
         along = place[..., 2]
-    wide = float(np.linalg.norm(place[-1] - place[0], axis=-1)[: size[1] // 3].max())
-    blotch = noise(place, 8.0 if sheet_rows else max(2.5, 0.8 * wide), rng)
+    width = float(np.linalg.norm(place[-1] - place[0], axis=-1)[: size[1] // 3].max())
+    blotch = noise(place, 8.0 if sheet_rows else max(2.5, 0.8 * width), rng)
     mottle, grain = noise(place, 1.1, rng), noise(place, 0.35, rng)
     across = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1).cumsum(axis=0)
-    full = across[-1] / across[-1, : size[1] // 2].max()
+    relative_width = across[-1] / across[-1, : size[1] // 2].max()
     lines = grain if sheet_rows else _lines(across, _LINES_PX[kind == "spatula"], rng)
     # Where a bar narrows to its tip, the texture's rows run apart, and bumps along them would show its faces.
-    flat = np.ones_like(full) if sheet_rows else step(1.6 * full - 0.9)
+    flat = np.ones_like(relative_width) if sheet_rows else step(1.6 * relative_width - 0.9)
     return _Texels(
-        kind, bool(sheet_rows), place, along, turned, flat, 0.5 * wide, blotch, mottle, grain, lines
+        kind, bool(sheet_rows), place, along, turned, flat, 0.5 * width, blotch, mottle, grain, lines
     )
 
 
 def _body(finish: Finish, texels: _Texels) -> _Layers:
     """Bare metal with its lines, wear and shapes, under the coat."""
     kind, along, lines, mottle = texels.kind, texels.along, texels.lines, texels.mottle
-    unworn = texels.turned + 0.3 * texels.blotch + 0.15 * texels.grain - 1.6 + 1.5 * finish.wear
-    worn = step(unworn / 0.4) * (finish.wear > 0)
+    wear_level = texels.turned + 0.3 * texels.blotch + 0.15 * texels.grain - 1.6 + 1.5 * finish.wear
+    worn_share = step(wear_level / 0.4) * (finish.wear > 0)
     edge = step(texels.turned - 0.8) * (not kind.startswith(("finger", *CLOTH)))
-    coat = step((along - finish.bare_mm) / 0.06) * (1 - worn)
-    bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn) + 0.004 * coat * mottle
+    coat = step((along - finish.bare_mm) / 0.06) * (1 - worn_share)
+    bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn_share) + 0.004 * coat * mottle
     bumps = bumps + 0.0012 * (1 - coat) * texels.flat * lines * (1 + 8 * finish.brushed)
     if kind == "spatula":  # no blade is flat: it is hollowed by rolling, and bent in use
         hollow = _HOLLOW * texels.half_mm * texels.across**2 * texels.flat
         bumps = bumps + (_WARP * texels.blotch + hollow) * (1 - coat)
-    rub = np.exp((0.1 + 0.8 * finish.brushed) * lines)
+    rubbing = np.exp((0.1 + 0.8 * finish.brushed) * lines)
     streak = 1 + (max(finish.streak, 1.0) - 1) * texels.flat
-    rough = np.stack([finish.alpha * streak * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
-    rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn)
-    bright = 1 + 0.08 * np.maximum(worn, edge) + 0.03 * mottle
-    base = np.asarray(finish.mirror, np.float32) * bright[..., None]
-    polished = np.zeros_like(along)
+    rough = np.stack([finish.alpha * streak * (1 - 0.2 * worn_share), finish.alpha * rubbing], axis=-1)
+    rough[..., 1] *= 1 - 0.5 * np.maximum(edge, worn_share)
+    brightness = 1 + 0.08 * np.maximum(worn_share, edge) + 0.03 * mottle
+    base = np.asarray(finish.mirror, np.float32) * brightness[..., None]
+    polish = np.zeros_like(along)
     if not (texels.sheet or kind == "spatula"):
         # The dark room beside the lamps and the light between them, as on any round shaft under a microscope.
-        dark = sum(depth * ridge(texels.across - place, width) for place, width, depth in _BANDS)
-        base = np.asarray(base * (1 - dark * texels.flat)[..., None], np.float32)
-        polished = _polished(texels, texels.across, _CREST, 0.8 + 0.2 * lines + 0.2 * mottle)
+        darkness = sum(depth * ridge(texels.across - place, width) for place, width, depth in _BANDS)
+        base = np.asarray(base * (1 - darkness * texels.flat)[..., None], np.float32)
+        polish = _polish(texels, texels.across, _CREST, 0.8 + 0.2 * lines + 0.2 * mottle)
     if kind == "spatula":
-        across = _wandering(texels)
+        across = _shift_across(texels)
         base = np.asarray(base * _sheen(texels, across), np.float32)
-        polished = _polished(texels, across, _FLASH, 0.85 + 0.1 * lines + 0.15 * mottle)
-    base, bumps = _shaped(texels, coat, base, bumps)
+        polish = _polish(texels, across, _FLASH, 0.85 + 0.1 * lines + 0.15 * mottle)
+    base, bumps = _engrave(texels, coat, base, bumps)
     # A coat that has been handled: it is dull in places, scratched, and grey where it is chalked.
-    handled = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
+    handling = step(0.8 * texels.blotch + 0.35 * mottle - 0.3) * coat
     scratch = step(lines - 1.6) * step(1.2 * mottle + 0.3)
-    pale = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
-    painted = np.asarray(finish.coat, np.float32) * pale + _CHALK * (handled + scratch)[..., None]
+    coat_brightness = np.clip(1 + 0.06 * mottle + 0.08 * lines + 0.25 * scratch, 0, 2)[..., None]
+    coat_colour = (
+        np.asarray(finish.coat, np.float32) * coat_brightness + _CHALK * (handling + scratch)[..., None]
+    )
     if not kind.startswith(("finger", "string", "fold", *CLOTH)):
-        painted, bumps = _moulded(finish, texels, handled, painted, bumps)
+        coat_colour, bumps = _mould(finish, texels, handling, coat_colour, bumps)
     if kind == "patty":
-        painted, bumps = _woven(texels, painted, bumps)
+        coat_colour, bumps = _weave(texels, coat_colour, bumps)
     if kind in _FOLDED:
-        painted, bumps = _fleshed(texels, painted, bumps)
-    base = over(base, painted, coat[..., None])
-    glossy = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
-    rough = over(rough, glossy * (1 + _DULLED * handled[..., None]), coat[..., None])
-    bare = (1 - coat) * (1 - finish.scattered) * (1 - polished)
+        coat_colour, bumps = _paint_flesh(texels, coat_colour, bumps)
+    base = over(base, coat_colour, coat[..., None])
+    gloss = finish.coat_alpha * np.array((finish.coat_streak, 1), np.float32)
+    rough = over(rough, gloss * (1 + _DULLED * handling[..., None]), coat[..., None])
+    bare = (1 - coat) * (1 - finish.scattered) * (1 - polish)
     return _Layers(base, bare, rough, over(base, _PLASTIC, coat[..., None]), np.zeros_like(along), bumps)
 
 
-def _polished(texels: _Texels, across: Map, band: tuple[float, float, float], broken: Map) -> Map:
+def _polish(texels: _Texels, across: Map, band: tuple[float, float, float], coverage: Map) -> Map:
     """Share (h, w) of light that a bright `band` scatters: its place `across`, width and most."""
     place, width, most = band
-    whole = np.clip(broken, 0, 1) * texels.flat
-    return np.asarray(most * whole * ridge(across - place, width), np.float32)
+    share = np.clip(coverage, 0, 1) * texels.flat
+    return np.asarray(most * share * ridge(across - place, width), np.float32)
 
 
 def _sheen(texels: _Texels, across: Map) -> Map:
     """Light (h, w, 3) that a flat blade mirrors, as a share of a lamp's: bent by hand, it shows the dark
     room and the bright field in soft bands along it, red near its tip, darkest beside its bright edges.
 
-    `across`: as of `_wandering`.
+    `across`: as of `_shift_across`.
     """
-    turned = across + 0.015 * texels.lines
-    dark = sum(depth * ridge(turned - place, width) for place, width, depth in _BLADE)
-    place, width, bright = _BRIM
-    aside = np.abs(texels.across)
-    brim = bright * ridge(aside - 1, 0.5 * width) - 0.3 * ridge(aside - place, width)
-    light = np.clip(1 - dark, 0.2, 1) + brim * texels.flat
-    near = np.exp(-texels.along / _REDDENED_MM)
-    return np.asarray(light[..., None] * (1 - near[..., None] * _REDDENED), np.float32)
+    bent_across = across + 0.015 * texels.lines
+    darkness = sum(depth * ridge(bent_across - place, width) for place, width, depth in _BLADE)
+    place, width, brightness = _BRIM
+    distance = np.abs(texels.across)
+    brim = brightness * ridge(distance - 1, 0.5 * width) - 0.3 * ridge(distance - place, width)
+    light = np.clip(1 - darkness, 0.2, 1) + brim * texels.flat
+    reddening = np.exp(-texels.along / _REDDENED_MM)
+    return np.asarray(light[..., None] * (1 - reddening[..., None] * _REDDENED), np.float32)
 
 
-def _wandering(texels: _Texels) -> Map:
+def _shift_across(texels: _Texels) -> Map:
     """Place (h, w) across a blade from about -1 to 1, shifted as it is bent along it."""
-    wander = gaussian_filter1d(texels.blotch.mean(axis=0), 0.1 * texels.blotch.shape[1], mode="nearest")
-    return np.asarray(texels.across + 0.35 * wander / max(float(wander.std()), 0.1), np.float32)
+    shift = gaussian_filter1d(texels.blotch.mean(axis=0), 0.1 * texels.blotch.shape[1], mode="nearest")
+    return np.asarray(texels.across + 0.35 * shift / max(float(shift.std()), 0.1), np.float32)
 
 
-def _moulded(finish: Finish, texels: _Texels, handled: Map, painted: Map, bumps: Map) -> tuple[Map, Map]:
+def _mould(finish: Finish, texels: _Texels, handling: Map, coat_colour: Map, bumps: Map) -> tuple[Map, Map]:
     """Albedo and bumps of a coat on a round shaft, with the collar in which it begins.
 
     The microscope's lamps are next to its lens, so that a shaft is darker towards its sides and glints along
     its crest, wherever it points: a coat's own lobe is too wide along it to show a line.
     """
-    lost, power = _ROUNDED
+    loss, power = _ROUNDED
     across, along = texels.across, texels.along
-    dull = np.clip(1 - 0.6 * handled + 0.15 * texels.lines + 0.2 * texels.mottle, 0, 1.3)
-    glint = sum(light * ridge(across - place, width) for place, width, light in _GLINTS) * dull
+    dullness = np.clip(1 - 0.6 * handling + 0.15 * texels.lines + 0.2 * texels.mottle, 0, 1.3)
+    glint = sum(light * ridge(across - place, width) for place, width, light in _GLINTS) * dullness
     length, groove = _COLLAR_MM
     collar = step((along - finish.bare_mm) / 0.1) * step((finish.bare_mm + length - along) / 0.1)
     joint = ridge(along - finish.bare_mm, groove) + 0.8 * ridge(along - finish.bare_mm - length, groove)
     joint = joint * (finish.bare_mm > 0)
     if texels.kind == "spatula":  # a flat blade
-        lost, glint = 0.0, 0 * glint
-    shade = (1 - lost * np.abs(across) ** power) * (1 - 0.35 * collar) * (1 - 0.75 * np.minimum(joint, 1))
-    whole = 0.6 + 0.4 * np.asarray(finish.coat, np.float32) / max(*finish.coat, 0.05)
-    painted = painted * shade[..., None] + (glint * (1 - np.minimum(joint, 1)))[..., None] * whole
+        loss, glint = 0.0, 0 * glint
+    shade = (1 - loss * np.abs(across) ** power) * (1 - 0.35 * collar) * (1 - 0.75 * np.minimum(joint, 1))
+    tint = 0.6 + 0.4 * np.asarray(finish.coat, np.float32) / max(*finish.coat, 0.05)
+    coat_colour = coat_colour * shade[..., None] + (glint * (1 - np.minimum(joint, 1)))[..., None] * tint
     bumps = np.asarray(bumps + 0.04 * collar - 0.05 * joint, np.float32)
-    return np.asarray(painted, np.float32), bumps
+    return np.asarray(coat_colour, np.float32), bumps
 
 
-def _woven(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
+def _weave(texels: _Texels, cotton: Map, bumps: Map) -> tuple[Map, Map]:
     """Albedo and bumps of a pad of cotton that soaks up fluid from its border: its threads, over and under
     each other, its rounded border, and the thread that shows in X-rays."""
     along, aside, _ = np.moveaxis(texels.place, -1, 0)
-    u, v = ((way + 0.04 * texels.mottle + 0.012 * texels.grain) / _WEAVE_MM for way in (along, aside))
-    above = np.mod(np.floor(u) + np.floor(v), 2) == 0
-    thread = np.where(above, np.sin(np.pi * u) ** 2, np.sin(np.pi * v) ** 2) * (0.8 + 0.2 * texels.grain)
-    dark, deep = _WOVEN
-    wide, lost, fall = _HEM
-    hem = np.clip(1 - (texels.along + 0.08 * texels.mottle) / wide, 0, 1) ** 2
-    cloth = painted * ((1 - dark * (1 - thread) + 0.05 * texels.blotch) * (1 - lost * hem))[..., None]
-    inwards = np.clip(texels.along / max(texels.half_mm, 0.1), 0, 1)
-    most, falls = _SOAKED
-    soaked = most * np.exp(-falls * inwards) * np.clip(1 + 0.5 * texels.blotch + 0.25 * texels.mottle, 0, 2)
-    cloth = through(cloth, soaked, _FILM)
+    u, v = (
+        (position + 0.04 * texels.mottle + 0.012 * texels.grain) / _WEAVE_MM for position in (along, aside)
+    )
+    warp_above = np.mod(np.floor(u) + np.floor(v), 2) == 0
+    thread = np.where(warp_above, np.sin(np.pi * u) ** 2, np.sin(np.pi * v) ** 2) * (0.8 + 0.2 * texels.grain)
+    gap_loss, gap_depth = _WOVEN
+    hem_width, hem_loss, hem_fall = _HEM
+    hem = np.clip(1 - (texels.along + 0.08 * texels.mottle) / hem_width, 0, 1) ** 2
+    cloth = cotton * ((1 - gap_loss * (1 - thread) + 0.05 * texels.blotch) * (1 - hem_loss * hem))[..., None]
+    inward_share = np.clip(texels.along / max(texels.half_mm, 0.1), 0, 1)
+    soak, decay = _SOAKED
+    soak_depth = (
+        soak * np.exp(-decay * inward_share) * np.clip(1 + 0.5 * texels.blotch + 0.25 * texels.mottle, 0, 2)
+    )
+    cloth = attenuate(cloth, soak_depth, _FILM)
     xray = step((0.11 - np.abs(aside + 0.03 * texels.mottle)) / 0.08) * (0.55 + 0.4 * thread)
-    return over(cloth, _XRAY, xray[..., None]), bumps + deep * thread - fall * hem
+    return over(cloth, _XRAY, xray[..., None]), bumps + gap_depth * thread - hem_fall * hem
 
 
-def _fleshed(texels: _Texels, painted: Map, bumps: Map) -> tuple[Map, Map]:
+def _paint_flesh(texels: _Texels, coat_colour: Map, bumps: Map) -> tuple[Map, Map]:
     """Albedo and bumps of a fold of cut skin: all of it, or what a clip's window shows of it."""
     share = np.ones_like(texels.along)
     if texels.kind == "clip":
         start, end, reach = _WINDOW
-        part = texels.along / texels.along.max()
-        share = step((part - start) / 0.03) * step((end - part) / 0.03) * step((reach - texels.across) / 0.06)
+        fraction = texels.along / texels.along.max()
+        share = (
+            step((fraction - start) / 0.03)
+            * step((end - fraction) / 0.03)
+            * step((reach - texels.across) / 0.06)
+        )
     muscle, fat, fascia = (np.array(colour, np.float32) for colour in _FLESH)
     flesh = muscle * (1 + 0.15 * texels.mottle + 0.06 * texels.grain)[..., None]
     flesh = over(flesh, fat, (0.8 * step((0.6 * texels.blotch + 0.4 * texels.mottle - 0.5) / 0.6))[..., None])
     flesh = over(flesh, fascia, (0.6 * step((texels.mottle - 0.7 * texels.blotch - 0.8) / 0.5))[..., None])
     edge = share * (1 - share) * 4
     relief = (0.012 * texels.mottle + 0.004 * texels.grain) * share - 0.25 * (texels.kind == "clip") * share
-    return over(painted, flesh, share[..., None]) * (1 - 0.6 * edge)[..., None], bumps + relief
+    return over(coat_colour, flesh, share[..., None]) * (1 - 0.6 * edge)[..., None], bumps + relief
 
 
-def _shaped(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map]:
+def _engrave(texels: _Texels, coat: Map, base: Map, bumps: Map) -> tuple[Map, Map]:
     """Base and bumps with forceps' serrations, or the rings that are etched into shafts."""
     along = texels.along
     if texels.kind in ("forceps", "bayonet"):
         start, end, period = _SERRATION_MM
         teeth = step((along - start) / 0.3) * step((end - along) / 0.6) * (1 - coat)
-        outwards = np.sign(texels.place[:, -1, 0].mean())  # a tine is bowed away from the other one
-        inner = step((-outwards * texels.across - 0.62) / 0.3)
-        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 2 * teeth * inner
-        dark, deep = _NOTCHED
-        return base * (1 - dark * notch[..., None]), bumps - deep * notch
+        outward_sign = np.sign(texels.place[:, -1, 0].mean())  # a tine is bowed away from the other one
+        inner_side = step((-outward_sign * texels.across - 0.62) / 0.3)
+        notch = (0.5 + 0.5 * np.cos(2 * np.pi * along / period)) ** 2 * teeth * inner_side
+        loss, depth = _NOTCHED
+        return base * (1 - loss * notch[..., None]), bumps - depth * notch
     if texels.kind in ("dissector", "suction"):
-        every, apart, width = _MARKS_MM
-        ring = np.mod(along - 0.5 * every, every)
-        mark = (ridge(ring, width, 0.5) + ridge(ring, width, 0.5 + apart)) * (along > every) * (1 - coat)
+        spacing, separation, width = _MARKS_MM
+        ring = np.mod(along - 0.5 * spacing, spacing)
+        mark = (
+            (ridge(ring, width, 0.5) + ridge(ring, width, 0.5 + separation)) * (along > spacing) * (1 - coat)
+        )
         return base * (1 - 0.6 * mark[..., None]), bumps - 0.02 * mark
     return base, bumps
 
 
-def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
+def _add_blood(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
     """With blood: a film that is brightest red where it is thin, a clot where it is thick, and its border.
 
     It has run and been wiped along a shaft.
@@ -358,53 +372,55 @@ def _bloodied(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.G
     if not finish.blood:
         return layers
     streak = texels.blotch if texels.sheet else _streaks(texels, rng)
-    uneven = 0.5 * streak + 0.25 * min(1.0, texels.half_mm / 3) * texels.blotch
-    uneven = uneven + 0.1 * (texels.mottle if texels.sheet else texels.lines)
+    unevenness = 0.5 * streak + 0.25 * min(1.0, texels.half_mm / 3) * texels.blotch
+    unevenness = unevenness + 0.1 * (texels.mottle if texels.sheet else texels.lines)
     tip = 0.5 * np.exp(-texels.along / 1.5) * (not texels.sheet)
-    share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + uneven + tip
-    ragged = texels.along + 0.25 * finish.blood_mm * np.clip(1 - streak, 0, 2)
-    shown_to = step((1.3 * finish.blood_mm - ragged) / 2)
-    deep = np.clip(share / 0.9 + 0.2, 0, 1.4) * shown_to
-    level, reach, thin = _SMEARED
-    wiped = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
-    deep = np.maximum(deep, np.clip(0.7 * wiped, 0, thin) * min(1, 3 * finish.blood) * (not texels.sheet))
+    share = 2 * finish.blood - 0.4 - texels.along / max(finish.blood_mm, 0.1) + unevenness + tip
+    border = texels.along + 0.25 * finish.blood_mm * np.clip(1 - streak, 0, 2)
+    reach_share = step((1.3 * finish.blood_mm - border) / 2)
+    depth = np.clip(share / 0.9 + 0.2, 0, 1.4) * reach_share
+    level, reach, smear_depth = _SMEARED
+    smear = 0.75 * streak + 0.2 * texels.mottle + 0.25 * texels.lines - level - texels.along / reach
+    depth = np.maximum(
+        depth, np.clip(0.7 * smear, 0, smear_depth) * min(1, 3 * finish.blood) * (not texels.sheet)
+    )
     if texels.kind == "spatula":  # on a smooth blade it is wiped to a thin film, thicker along its border
-        deep = _THINNED * deep * np.clip(0.9 + 0.1 * texels.lines + 0.35 * texels.mottle, 0.2, 1.6)
+        depth = _THINNED * depth * np.clip(0.9 + 0.1 * texels.lines + 0.35 * texels.mottle, 0.2, 1.6)
     # In cloth blood is soaked up, and its threads show.
-    film, clot = step(deep / 0.15 - 0.5), 0.92 * step((deep - 0.75) / 0.5) * (not texels.sheet)
+    film, clot = step(depth / 0.15 - 0.5), 0.92 * step((depth - 0.75) / 0.5) * (not texels.sheet)
     if texels.sheet:
-        deep = np.clip(deep * (0.6 + 0.3 * texels.mottle), 0, _DRUNK)
-    edged = deep + 0.25 * ridge(deep, 0.12, 0.12) * film
-    smooth = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]
+        depth = np.clip(depth * (0.6 + 0.3 * texels.mottle), 0, _DRUNK)
+    edge_depth = depth + 0.25 * ridge(depth, 0.12, 0.12) * film
+    smoothing = (0.6 * np.maximum(film, clot) * (texels.kind not in CLOTH))[..., None]
     return _Layers(
-        base=over(through(layers.base, edged, _FILM), _BLOOD, clot[..., None]),
+        base=over(attenuate(layers.base, edge_depth, _FILM), _BLOOD, clot[..., None]),
         bare=layers.bare * (1 - clot),
-        rough=over(layers.rough, np.full(1, 0.1, np.float32), smooth),
-        mirror=over(through(layers.mirror, deep, _FILM), _PLASTIC, clot[..., None]),
+        rough=over(layers.rough, np.full(1, 0.1, np.float32), smoothing),
+        mirror=over(attenuate(layers.mirror, depth, _FILM), _PLASTIC, clot[..., None]),
         wet=film,
-        bumps=layers.bumps + _BLOOD_MM * (step(deep / 0.7 - 0.5) + 0.15 * texels.mottle * clot),
+        bumps=layers.bumps + _BLOOD_MM * (step(depth / 0.7 - 0.5) + 0.15 * texels.mottle * clot),
     )
 
 
-def _wetted(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
+def _add_water(finish: Finish, texels: _Texels, layers: _Layers, rng: np.random.Generator) -> _Layers:
     """With water: a wavy film on the tip, drops further up."""
-    ends = finish.wet_mm * (1 + 0.5 * texels.blotch) - texels.along
-    wet = step(ends / 1.2 + 0.3 * texels.mottle) * (finish.wet_mm > 0)
+    margin = finish.wet_mm * (1 + 0.5 * texels.blotch) - texels.along
+    wetness = step(margin / 1.2 + 0.3 * texels.mottle) * (finish.wet_mm > 0)
     drops = _drops(texels.place, texels.along, finish, rng)
-    bumps = layers.bumps + drops + 0.003 * wet * texels.mottle
-    wet = np.maximum.reduce([0.8 * wet, layers.wet, step(drops / 0.02 - 0.5)])
-    return replace(layers, bumps=bumps, wet=0.3 * wet if texels.kind in CLOTH else wet)
+    bumps = layers.bumps + drops + 0.003 * wetness * texels.mottle
+    wetness = np.maximum.reduce([0.8 * wetness, layers.wet, step(drops / 0.02 - 0.5)])
+    return replace(layers, bumps=bumps, wet=0.3 * wetness if texels.kind in CLOTH else wetness)
 
 
-def noise(at: Floats | Map, wave_mm: float, rng: np.random.Generator) -> Map:
+def noise(points: Floats | Map, wave_mm: float, rng: np.random.Generator) -> Map:
     """Smooth noise (...) of unit variance at places (..., n) mm."""
-    waves = rng.normal(size=(at.shape[-1], 16)) * 2 * np.pi / wave_mm
+    waves = rng.normal(size=(points.shape[-1], 16)) * 2 * np.pi / wave_mm
     phase = rng.uniform(0, 2 * np.pi, 16)
-    angle = np.asarray(at, np.float32) @ waves.astype(np.float32) + phase.astype(np.float32)
+    angle = np.asarray(points, np.float32) @ waves.astype(np.float32) + phase.astype(np.float32)
     return np.asarray(np.cos(angle).sum(axis=-1) / np.float32(np.sqrt(8)), np.float32)
 
 
-def _shown(turn: int) -> Indices:
+def _visible_columns(turn: int) -> Indices:
     """Columns of a bar's rings in the half that its texture shows, in the order of the texture's rows."""
     return ((turn + np.arange(RING // 4, -RING // 4 - 1, -1)) % RING).astype(np.int32)
 
@@ -445,30 +461,32 @@ def _lines(across: Map, width_px: float, rng: np.random.Generator) -> Map:
 
 def _streaks(texels: _Texels, rng: np.random.Generator) -> Map:
     """Noise (h, w) of unit variance, long along a part, and wide on wide ones."""
-    (wave, short), place = _STREAKS, texels.place
-    wide = max(1.0, texels.half_mm / _BROAD_MM)
-    coarse = noise(place[::2, ::4] * np.array((1, 1, short * wide), np.float32), wave * wide, rng)
+    (wave, shortening), place = _STREAKS, texels.place
+    widening = max(1.0, texels.half_mm / _BROAD_MM)
+    coarse = noise(
+        place[::2, ::4] * np.array((1, 1, shortening * widening), np.float32), wave * widening, rng
+    )
     return np.asarray(cv2.resize(coarse, place.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def _drops(place: Map, along: Map, finish: Finish, rng: np.random.Generator) -> Map:
     """Height (h, w) mm of drops of water on the first part of a bar."""
-    high = np.zeros(along.shape, np.float32)
+    heights = np.zeros(along.shape, np.float32)
     if not finish.wet_mm:
-        return high
+        return heights
     reach = np.flatnonzero(
         (along[len(along) // 2] > 0.3) & (along[len(along) // 2] < min(3 * finish.wet_mm, _DROPS_MM))
     )
     for _ in range(rng.poisson(_DROPS * finish.wet_mm) if len(reach) else 0):
         row, column = rng.integers(len(along)), rng.choice(reach)
         radius = float(np.exp(rng.uniform(np.log(_DROP_MM[0]), np.log(_DROP_MM[1]))))
-        near = np.flatnonzero(np.abs(along[row] - along[row, column]) < 2 * radius)
-        away = place[:, near] - place[row, column]
-        turn = np.arctan2(away[..., 1], away[..., 2]) + rng.uniform(0, 2 * np.pi)
-        ragged = radius * (1 + 0.25 * np.cos(2 * turn) + 0.12 * np.cos(3 * turn + 1))
-        away2 = (away**2).sum(axis=-1) / ragged**2
-        high[:, near] = np.maximum(high[:, near], _FLAT * radius * np.clip(1 - away2, 0, 1))
-    return high
+        columns = np.flatnonzero(np.abs(along[row] - along[row, column]) < 2 * radius)
+        offsets = place[:, columns] - place[row, column]
+        turn = np.arctan2(offsets[..., 1], offsets[..., 2]) + rng.uniform(0, 2 * np.pi)
+        radii = radius * (1 + 0.25 * np.cos(2 * turn) + 0.12 * np.cos(3 * turn + 1))
+        distances2 = (offsets**2).sum(axis=-1) / radii**2
+        heights[:, columns] = np.maximum(heights[:, columns], _FLAT * radius * np.clip(1 - distances2, 0, 1))
+    return heights
 
 
 def _normals(bumps: Map, place: Map) -> Map:

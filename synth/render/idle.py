@@ -43,16 +43,16 @@ class IdleInstrument:
         turn = 2 * np.pi * seconds / self.period_s + self.phase
         shaft, aside = np.asarray(self.shaft), np.asarray(self.aside)
         across = self.drift_mm * np.sin(turn) + 0.5 * self.gap_mm * np.array([[-1], [1]])
-        back = self.travel_mm * (1 - np.cos(turn)) / 2
-        return np.asarray(self.tip_mm) + back * shaft + across * aside, np.stack([shaft, shaft])
+        retraction = self.travel_mm * (1 - np.cos(turn)) / 2
+        return np.asarray(self.tip_mm) + retraction * shaft + across * aside, np.stack([shaft, shaft])
 
 
 def with_idle(
     idle: Sequence[IdleInstrument], seconds: float, tips: Floats, shafts: Floats
 ) -> tuple[Floats, Floats]:
     """Tips (2n, 3) mm and shafts (2n, 3) of acting instruments, followed by those of idle ones."""
-    poses = [(tips, shafts), *(one.at(seconds) for one in idle)]
-    return np.concatenate([one for one, _ in poses]), np.concatenate([other for _, other in poses])
+    poses = [(tips, shafts), *(instrument.at(seconds) for instrument in idle)]
+    return np.concatenate([tip for tip, _ in poses]), np.concatenate([shaft for _, shaft in poses])
 
 
 def draw_idle(
@@ -63,41 +63,47 @@ def draw_idle(
     `opening_mm` and `visible_mm`: radii of the opening and of the view; `acting`: (n, 2, 3) point of contact
     [mm] and shaft of each acting instrument.
     """
-    found, lines = list[IdleInstrument](), list(acting)
+    instruments, lines = list[IdleInstrument](), list(acting)
     for _ in range(rng.binomial(_MOST, 0.5 * strength)):
         for _ in range(_TRIES):
-            one = _drawn(rng, opening_mm, visible_mm)
-            if _clear(one, np.reshape(lines, (-1, 2, 3))):
-                found.append(one)
-                if one.kind not in CLOTH:  # which lies under other idle instruments
-                    lines.append(np.array([one.tip_mm, one.shaft]))
+            instrument = _draw(rng, opening_mm, visible_mm)
+            if _is_clear(instrument, np.reshape(lines, (-1, 2, 3))):
+                instruments.append(instrument)
+                if instrument.kind not in CLOTH:  # which lies under other idle instruments
+                    lines.append(np.array([instrument.tip_mm, instrument.shaft]))
                 break
-    return tuple(found)
+    return tuple(instruments)
 
 
-def _drawn(rng: np.random.Generator, opening_mm: float, visible_mm: float) -> IdleInstrument:
+def _draw(rng: np.random.Generator, opening_mm: float, visible_mm: float) -> IdleInstrument:
     """A tool whose hand is outside the view, or cloth near the opening's edge."""
     kind = str(rng.choice([*RADII_MM, *RADII_MM, *_TOOLS]))
-    cloth, moves = kind in CLOTH, float(rng.random() < 0.6)
-    radius, around = rng.uniform(*RADII_MM.get(kind, (2.0, 6.0))), rng.uniform(0, 2 * np.pi)
-    away = min(visible_mm, 1.5 * opening_mm) * rng.uniform() ** 0.5
-    lean, hand, high = np.radians(rng.uniform(15, 60)), around + rng.normal(0, 0.7), rng.uniform(2, 20)
-    high = max(_TISSUE_MM + high, _RIM_MM - np.tan(lean) * (opening_mm - away))
-    high += radius if kind in RADII_MM else 1.5
-    if cloth:
-        away, lean = min(visible_mm, opening_mm) + rng.uniform(-0.5, 0.7) * radius, np.pi / 2
-        high = moves = 0.0
-    tip = float(away * np.cos(around)), float(away * np.sin(around)), float(high)
-    c, s = float(np.cos(hand)), float(np.sin(hand))
-    shaft = c * float(np.cos(lean)), s * float(np.cos(lean)), float(np.sin(lean))
-    path = rng.uniform((0.5, 0, 0, 2, 0), (5, 30 * moves, 3 * moves, 8, 2 * np.pi)).tolist()
+    is_cloth, motion = kind in CLOTH, float(rng.random() < 0.6)
+    radius, azimuth = rng.uniform(*RADII_MM.get(kind, (2.0, 6.0))), rng.uniform(0, 2 * np.pi)
+    distance = min(visible_mm, 1.5 * opening_mm) * rng.uniform() ** 0.5
+    elevation, hand_azimuth, height = (
+        np.radians(rng.uniform(15, 60)),
+        azimuth + rng.normal(0, 0.7),
+        rng.uniform(2, 20),
+    )
+    height = max(_TISSUE_MM + height, _RIM_MM - np.tan(elevation) * (opening_mm - distance))
+    height += radius if kind in RADII_MM else 1.5
+    if is_cloth:
+        distance, elevation = min(visible_mm, opening_mm) + rng.uniform(-0.5, 0.7) * radius, np.pi / 2
+        height = motion = 0.0
+    tip = float(distance * np.cos(azimuth)), float(distance * np.sin(azimuth)), float(height)
+    c, s = float(np.cos(hand_azimuth)), float(np.sin(hand_azimuth))
+    shaft = c * float(np.cos(elevation)), s * float(np.cos(elevation)), float(np.sin(elevation))
+    path = rng.uniform((0.5, 0, 0, 2, 0), (5, 30 * motion, 3 * motion, 8, 2 * np.pi)).tolist()
     return IdleInstrument(kind, float(radius), tip, shaft, (-s, c, 0.0), *path)
 
 
-def _clear(one: IdleInstrument, others: Floats) -> bool:
+def _is_clear(instrument: IdleInstrument, others: Floats) -> bool:
     """Whether an instrument is apart from others on its path; `others`: (n, 2, 3) points mm and shafts."""
     along = np.linspace(0, 110, 56)[:, None]
-    own = np.asarray(one.tip_mm) + along * (0 if one.kind in CLOTH else np.asarray(one.shaft))
+    axis_points = np.asarray(instrument.tip_mm) + along * (
+        0 if instrument.kind in CLOTH else np.asarray(instrument.shaft)
+    )
     lines = (others[:, :1] + along * others[:, 1:]).reshape(-1, 1, 3)
-    apart = np.linalg.norm(lines - own, axis=2).min(initial=np.inf)
-    return float(apart) >= _APART_MM + one.radius_mm + one.drift_mm + 0.5 * one.gap_mm
+    gap = np.linalg.norm(lines - axis_points, axis=2).min(initial=np.inf)
+    return float(gap) >= _APART_MM + instrument.radius_mm + instrument.drift_mm + 0.5 * instrument.gap_mm

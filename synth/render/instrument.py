@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
-from synth.geometry.triangles import Shape, grid_faces, joined
+from synth.geometry.triangles import Shape, grid_faces, join_shapes
 from synth.render import finish, finish_maps
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
@@ -121,7 +121,7 @@ class InstrumentMesh:
 
     @property
     def owner(self) -> Indices:
-        sizes = [sum(len(part.profile) for part in one) for one in self.parts]
+        sizes = [sum(len(part.profile) for part in parts) for parts in self.parts]
         return np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)[self.faces[:, 0]]
 
     def pose(self, tips: Floats, shafts: Floats) -> Shape:
@@ -129,44 +129,46 @@ class InstrumentMesh:
         their middle."""
         if len(tips) != 2 * len(self.parts):
             raise UserError(f"{len(tips)} tips for {len(self.parts)} instruments; give two for each")
-        each = zip(self.parts, tips.reshape(-1, 2, 3), shafts.reshape(-1, 2, 3), strict=True)
-        return Shape(np.concatenate([bar for one in each for bar in place(*one)]), self.faces)
+        placements = zip(self.parts, tips.reshape(-1, 2, 3), shafts.reshape(-1, 2, 3), strict=True)
+        return Shape(
+            np.concatenate([bar for placement in placements for bar in place(*placement)]), self.faces
+        )
 
     def glow(self, posed: Shape) -> Floats:
         return reflection.glow(posed, self.alpha, self.bare, self.theatre)
 
     def touch(self, posed: Shape, surface: Floats) -> tuple[Floats, Floats]:
-        near, away = _near(posed, surface)
+        indices, distances = _find_close(posed, surface)
         height, share = np.zeros(len(surface)), np.ones(len(surface))
-        height[near] = _CLIMB_MM * np.exp(-np.maximum(away - _TOUCH_MM, 0) / _REACH_MM)
-        share[near] = 1 - _SHADE * np.exp(-((away / _SHADE_MM) ** 2))
+        height[indices] = _CLIMB_MM * np.exp(-np.maximum(distances - _TOUCH_MM, 0) / _REACH_MM)
+        share[indices] = 1 - _SHADE * np.exp(-((distances / _SHADE_MM) ** 2))
         return height, share
 
 
-def _near(posed: Shape, surface: Floats) -> tuple[Indices, Floats]:
+def _find_close(posed: Shape, surface: Floats) -> tuple[Indices, Floats]:
     """Indices (n,) of points (V, 3) mm that may be near a mesh, and their distances from its vertices."""
     low, high = surface.min(axis=0) - _AWAY_MM, surface.max(axis=0) + _AWAY_MM
-    ends = posed.vertices[((posed.vertices > low) & (posed.vertices < high)).all(axis=1)]
-    if not len(ends):
+    vertices = posed.vertices[((posed.vertices > low) & (posed.vertices < high)).all(axis=1)]
+    if not len(vertices):
         return np.zeros(0, np.int32), np.zeros(0)
-    low, high = ends.min(axis=0) - _AWAY_MM, ends.max(axis=0) + _AWAY_MM
-    near = np.flatnonzero(((surface > low) & (surface < high)).all(axis=1))
-    away, _ = cKDTree(ends).query(surface[near], distance_upper_bound=_AWAY_MM)
-    return near.astype(np.int32), np.asarray(away)
+    low, high = vertices.min(axis=0) - _AWAY_MM, vertices.max(axis=0) + _AWAY_MM
+    indices = np.flatnonzero(((surface > low) & (surface < high)).all(axis=1))
+    distances, _ = cKDTree(vertices).query(surface[indices], distance_upper_bound=_AWAY_MM)
+    return indices.astype(np.int32), np.asarray(distances)
 
 
-def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
+def place(parts: Sequence[Part], tips: Floats, shafts: Floats) -> list[Floats]:
     """Vertices (V, 3) mm of each part of an instrument with its tips and shafts (2, 3)."""
-    placed = []
+    vertices = []
     for part in parts:
         # The flat sides of two tines face each other; a single blade's faces the tissue.
         if part.side == 0:
-            tip, shaft, across = ends.mean(axis=0), ways.mean(axis=0), np.array([0.0, 0.0, 1.0])
+            tip, shaft, across = tips.mean(axis=0), shafts.mean(axis=0), np.array([0.0, 0.0, 1.0])
         else:
-            tip, shaft = (pair[0 if part.side == 1 else 1] for pair in (ends, ways))
-            across = ends[1] - ends[0]
-        placed.append(tip + part.profile @ _axes(shaft, across))
-    return placed
+            tip, shaft = (pair[0 if part.side == 1 else 1] for pair in (tips, shafts))
+            across = tips[1] - tips[0]
+        vertices.append(tip + part.profile @ _axes(shaft, across))
+    return vertices
 
 
 def shape_of(
@@ -184,7 +186,7 @@ def shape_of(
 
 
 def build(
-    drawn: Sequence[tuple[str, float]],
+    tools: Sequence[tuple[str, float]],
     theatre: Theatre,
     rng: np.random.Generator,
     strength: float = 0.0,
@@ -195,51 +197,57 @@ def build(
 ) -> InstrumentMesh | None:
     """Instruments in a theatre, with finishes drawn for each; None if there is none.
 
-    `drawn`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
+    `tools`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
     sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `mm_per_px`: of the picture; `meshes`:
     as of `shape_of`.
     """
-    sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
-    made = [shape_of(kind, a, size, meshes) for (kind, a), size in zip(drawn, sizes, strict=True)]
-    made += [
-        ((lay_cloth(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
-        for one in idle
+    sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(tools)) - 1)
+    instruments = [shape_of(kind, a, size, meshes) for (kind, a), size in zip(tools, sizes, strict=True)]
+    instruments += [
+        ((lay_cloth(instrument, ground, rng),), 0.0)
+        if instrument.kind in CLOTH
+        else shape_of(instrument.kind, instrument.radius_mm)
+        for instrument in idle
     ]
-    parts = tuple(shapes for shapes, _ in made)
+    parts = tuple(shapes for shapes, _ in instruments)
     if not any(parts):
         return None
     textures = list[tuple[Map, FinishMaps]]()
-    for own, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
+    for bars, kind in zip(
+        parts, [*(kind for kind, _ in tools), *(instrument.kind for instrument in idle)], strict=True
+    ):
         skin = finish.draw_finish(strength, rng, kind)
-        textures += [(part.uv, part.maps(skin, kind, rng, mm_per_px)) for part in own]
-    faces = joined(*(part.shape for own in parts for part in own)).faces
+        textures += [(part.uv, part.maps(skin, kind, rng, mm_per_px)) for part in bars]
+    faces = join_shapes(*(part.shape for bars in parts for part in bars)).faces
     return InstrumentMesh(parts, faces, *stack_maps(textures), theatre)
 
 
-def lay_cloth(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
+def lay_cloth(cloth: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
     """A cloth that lies on points (N, 3) mm, gauze in folds."""
-    half = one.radius_mm, one.radius_mm * (0.46 if one.kind == "patty" else 0.8)
+    half = cloth.radius_mm, cloth.radius_mm * (0.46 if cloth.kind == "patty" else 0.8)
     rows, columns = (int(2 * side / _SHEET_MM) for side in half)
     sides = (np.linspace(-half[0], half[0], rows), np.linspace(half[1], -half[1], columns))
     u, v = (axis.ravel() for axis in np.meshgrid(*sides, indexing="ij"))  # faces turn upwards
-    (tip, _), (shaft, _) = one.at(0.0)
-    at = np.column_stack([u, v, np.zeros(len(u))])
-    _, near = cKDTree(ground[:, :2]).query((tip + at @ _axes(shaft, np.asarray(one.aside)))[:, :2], k=6)
-    below = ground[near % len(ground), 2].max(axis=1).reshape(rows, columns)
-    z = np.maximum(gaussian_filter(below, 1.5, mode="nearest"), below) + _LAID_MM
+    (tip, _), (shaft, _) = cloth.at(0.0)
+    points = np.column_stack([u, v, np.zeros(len(u))])
+    _, neighbours = cKDTree(ground[:, :2]).query(
+        (tip + points @ _axes(shaft, np.asarray(cloth.aside)))[:, :2], k=6
+    )
+    ground_z = ground[neighbours % len(ground), 2].max(axis=1).reshape(rows, columns)
+    z = np.maximum(gaussian_filter(ground_z, 1.5, mode="nearest"), ground_z) + _LAID_MM
     z[1:-1, 1:-1] += 0.3  # its border is lower
-    if one.kind == "gauze":
-        z += 0.5 * np.maximum(finish_maps.noise(at, 9.0, rng), 0).reshape(z.shape)
+    if cloth.kind == "gauze":
+        z += 0.5 * np.maximum(finish_maps.noise(points, 9.0, rng), 0).reshape(z.shape)
     return Part(np.column_stack([u, v, z.ravel() - tip[2]]), 1, rows)
 
 
-def sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
-    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
+def sweep(s: Floats, thickness: Floats, width: Floats, bow: Floats, power: float) -> Floats:
+    """Rings (V, 3) at z = `s`: half axes `thickness`, `width`, shifted by `bow` along x; round at power 1."""
     angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
     c, w = np.cos(angle), np.sin(angle)
     x = np.sign(c) * np.abs(c) ** power
     y = np.sign(w) * np.abs(w) ** power
-    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
+    columns = [thickness[:, None] * x + bow[:, None], width[:, None] * y, np.repeat(s[:, None], len(x), 1)]
     return np.stack(columns, -1).reshape(-1, 3)
 
 
@@ -270,25 +278,25 @@ def _forceps(half: float, aside_mm: float = 0.0) -> tuple[Part, ...]:
     """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1), and the handle
     shifted by `aside_mm`, out of view."""
     s = _along()
-    close = _round_off(s, 0.45)
-    wide = (half - 0.03 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
-    thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
+    closing = _round_off(s, 0.45)
+    width = (half - 0.03 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * closing
+    thickness = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * closing
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
     bend = np.clip((s - 24.0) / 14.0, 0, 1)
     shift = np.repeat(aside_mm * bend**2 * (3 - 2 * bend), RING)[:, None] * [0.0, 1.0, 0.0]
-    return tuple(Part(sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
+    return tuple(Part(sweep(s, thickness, width, -side * bow, 0.7) + shift, side) for side in (1, -1))
 
 
 def _dissector(half: float) -> tuple[Part, ...]:
     """A small rounded blade on a thin round shaft, slightly bent, that ends in a thicker handle."""
     s = _along()
-    close = _round_off(s, 1.4)
+    closing = _round_off(s, 1.4)
     neck = np.exp(-((s / 5.0) ** 2))
     handle = 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
-    thick = (0.28 + 0.55 * (1 - neck) + handle) * np.minimum(close * 1.4, 1)
-    wide = (0.83 + (half - 0.75) * neck + handle) * close
+    thickness = (0.28 + 0.55 * (1 - neck) + handle) * np.minimum(closing * 1.4, 1)
+    width = (0.83 + (half - 0.75) * neck + handle) * closing
     bow = 1.6 * np.exp(-s / 6.0) - 1.6
-    return (Part(sweep(s, thick, wide, bow, 0.9), 0),)
+    return (Part(sweep(s, thickness, width, bow, 0.9), 0),)
 
 
 def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[Part, ...]:
@@ -296,8 +304,8 @@ def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[
     outside = 0.12 + _along()
     inside = np.array([8.0, 3.0, 1.0, 0.3, 0.05])
     s = np.concatenate([inside, outside])
-    grown = 0.05 + wider_mm / (1 + np.exp(-(outside - 55.0) / 4.0))
-    radius = half + np.concatenate([np.full(5, -0.3 * min(half, 0.5)), grown])
+    widening = 0.05 + wider_mm / (1 + np.exp(-(outside - 55.0) / 4.0))
+    radius = half + np.concatenate([np.full(5, -0.3 * min(half, 0.5)), widening])
     radius[5] = half - 0.05  # a blunted edge
     bow = bend_mm * (1 - np.exp(-((s / 45.0) ** 2)))
     return (Part(sweep(s, radius, radius, bow, 1.0), 0),)
@@ -306,20 +314,21 @@ def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[
 def _spatula(half: float) -> tuple[Part, ...]:
     """A flat ribbon with a round end, bent where it leaves the wound."""
     s = _along()
-    wide = (half + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, half)
-    thick = np.full_like(s, 0.32) * _round_off(s, 0.3)
+    width = (half + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, half)
+    thickness = np.full_like(s, 0.32) * _round_off(s, 0.3)
     bow = 4.0 * (1 - np.exp(-((s / 30.0) ** 2)))
-    return (Part(sweep(s, thick, wide, bow, 0.35), 0),)
+    return (Part(sweep(s, thickness, width, bow, 0.35), 0),)
 
 
 def _probe(half: float) -> tuple[Part, ...]:
     """A ball on a thin shaft; at 50 degrees its lowest point is the tip."""
     s = _along()
-    least = np.where(s > half, 0.45 * half, 0.03 * half)  # a ring of no radius would have faces without area
-    radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), least)
+    # A ring of no radius would have faces without area.
+    least_radius = np.where(s > half, 0.45 * half, 0.03 * half)
+    radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), least_radius)
     radius += 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
-    low, up = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
-    return (Part(sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)
+    tip_mm, lift_mm = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
+    return (Part(sweep(s - tip_mm, radius, radius, np.full_like(s, lift_mm), 1.0), 0),)
 
 
 def _rod(half: float, bend: float = 0.0) -> tuple[Part, ...]:

@@ -65,21 +65,21 @@ def _read(file: PlacedFile, state: object) -> OwnMesh:
     name = file.path.name
     vertices, faces = read_triangles(file.path)
     try:
-        placed = place_mesh(vertices, faces, file.tip, file.axis, file.up, file.unit_mm)
+        points = place_mesh(vertices, faces, file.tip, file.axis, file.up, file.unit_mm)
     except ValueError as error:
         raise UserError(f"fem.instrument: {name} {error}") from None
-    if (long := placed[:, 2].max()) < _SHORT_MM:
+    if (length := points[:, 2].max()) < _SHORT_MM:
         warnings.warn(
-            f"fem.instrument: {name} ends {long:.3g} mm from its tip, which may show in the picture; is "
+            f"fem.instrument: {name} ends {length:.3g} mm from its tip, which may show in the picture; is "
             "unit_mm right?",
             Caution,
             stacklevel=1,
         )
-    for array in (placed, faces):
+    for array in (points, faces):
         array.flags.writeable = False
-    near = placed[placed[:, 2] <= max(placed[:, 2].min(), 0.0) + _TIP_MM]
-    half = float(np.clip(np.median(np.hypot(*near[:, :2].T)), *_WIDE_MM))
-    return OwnMesh(Part(placed, 0, faces=faces.astype(np.int32), outline=outline_mesh(placed, faces)), half)
+    tip_points = points[points[:, 2] <= max(points[:, 2].min(), 0.0) + _TIP_MM]
+    half = float(np.clip(np.median(np.hypot(*tip_points[:, :2].T)), *_WIDE_MM))
+    return OwnMesh(Part(points, 0, faces=faces.astype(np.int32), outline=outline_mesh(points, faces)), half)
 
 
 def read_triangles(path: Path) -> tuple[Floats, Ints]:
@@ -135,8 +135,8 @@ def place_mesh(
     span = unit_mm * np.ptp(vertices, axis=0).max()
     if not _LONG_MM[0] <= span <= _LONG_MM[1]:
         unit, factor = min(_UNITS_MM.items(), key=lambda item: abs(np.log(item[1] * span / _USUAL_MM)))
-        likely = _LONG_MM[0] <= factor * span <= _LONG_MM[1]
-        hint = f"; if it is in {unit}, unit_mm is {factor * unit_mm:g}" if likely else "; state unit_mm"
+        plausible = _LONG_MM[0] <= factor * span <= _LONG_MM[1]
+        hint = f"; if it is in {unit}, unit_mm is {factor * unit_mm:g}" if plausible else "; state unit_mm"
         raise ValueError(f"is {span:.3g} mm long, instruments are {_LONG_MM[0]:g} to {_LONG_MM[1]:g}{hint}")
     z = np.asarray(axis) / np.linalg.norm(axis)
     level = np.asarray(up if up is not None else (0.0, 0.0, 1.0))
@@ -147,41 +147,41 @@ def place_mesh(
     if (size := np.linalg.norm(x)) < 0.1:
         raise ValueError("has its direction up along its axis; up points from the tissue, across the shaft")
     x /= size
-    placed = np.ascontiguousarray(unit_mm * (vertices - np.asarray(tip)) @ np.stack([x, np.cross(z, x), z]).T)
-    if (gap := _distance(placed[faces])) > _OFF_MM:
-        near = (vertices[np.linalg.norm(placed, axis=1).argmin()]).round(3).tolist()
-        ends = [vertices[k].round(3).tolist() for k in (placed[:, 2].argmin(), placed[:, 2].argmax())]
+    points = np.ascontiguousarray(unit_mm * (vertices - np.asarray(tip)) @ np.stack([x, np.cross(z, x), z]).T)
+    if (gap := _distance(points[faces])) > _OFF_MM:
+        point = (vertices[np.linalg.norm(points, axis=1).argmin()]).round(3).tolist()
+        ends = [vertices[k].round(3).tolist() for k in (points[:, 2].argmin(), points[:, 2].argmax())]
         raise ValueError(
-            f"has its tip {gap:.3g} mm outside of the mesh; its nearest point is {near}, its ends along the "
+            f"has its tip {gap:.3g} mm outside of the mesh; its nearest point is {point}, its ends along the "
             f"axis are {ends[0]} and {ends[1]} (state tip, in the file's unit)"
         )
-    behind, before = -placed[:, 2].min(), placed[:, 2].max()
-    if before < max(behind, _ALONG * span):
+    backward, forward = -points[:, 2].min(), points[:, 2].max()
+    if forward < max(backward, _ALONG * span):
         raise ValueError(
-            f"reaches {before:.3g} mm from its tip along its axis, {behind:.3g} mm against it, and is "
+            f"reaches {forward:.3g} mm from its tip along its axis, {backward:.3g} mm against it, and is "
             f"{span:.3g} mm long; axis points from the tip to the hand"
         )
-    return placed
+    return points
 
 
-def outline_mesh(placed: Floats, faces: Ints) -> Floats:
+def outline_mesh(vertices: Floats, faces: Ints) -> Floats:
     """Rings (R * RING, 3) mm, round, that enclose slices of a mesh across z, and two past its ends."""
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    start, end = np.moveaxis(placed[np.unique(sides, axis=0)], 1, 0)
-    bounds = np.linspace(placed[:, 2].min(), placed[:, 2].max(), _SLICES + 1)
+    start, end = np.moveaxis(vertices[np.unique(sides, axis=0)], 1, 0)
+    bounds = np.linspace(vertices[:, 2].min(), vertices[:, 2].max(), _SLICES + 1)
     rise = end[:, 2] - start[:, 2]
-    safe = np.where(np.abs(rise) < 1e-9, 1.0, rise)
+    safe_rise = np.where(np.abs(rise) < 1e-9, 1.0, rise)
     turn = np.linspace(0, 2 * np.pi, RING, endpoint=False)
     rings = []
     for low, high in pairwise(bounds):
-        cuts = np.sort([(low - start[:, 2]) / safe, (high - start[:, 2]) / safe], axis=0).clip(0, 1)
+        cuts = np.sort([(low - start[:, 2]) / safe_rise, (high - start[:, 2]) / safe_rise], axis=0).clip(0, 1)
         level = np.abs(rise) < 1e-9
         cuts[:, level] = [[0.0], [1.0]]
-        met = (np.maximum(start[:, 2], end[:, 2]) >= low) & (np.minimum(start[:, 2], end[:, 2]) <= high)
-        if not met.any():
+        crossed = (np.maximum(start[:, 2], end[:, 2]) >= low) & (np.minimum(start[:, 2], end[:, 2]) <= high)
+        if not crossed.any():
             continue
-        cut = start[met] + cuts[:, met, None] * (end - start)[met]
-        points = cut.reshape(-1, 3)[:, :2]
+        segments = start[crossed] + cuts[:, crossed, None] * (end - start)[crossed]
+        points = segments.reshape(-1, 3)[:, :2]
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = np.linalg.norm(points - middle, axis=1).max()
         ring = middle + radius * np.column_stack([np.cos(turn), np.sin(turn)])

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from synth.arrays import Array, Floats, Map, Mask, Pixels
-from synth.geometry.triangles import Shape, joined, normals
+from synth.geometry.triangles import Shape, join_shapes, normals
 from synth.render import truth
 from synth.render.anatomy import noise
 from synth.render.appearance import light
@@ -55,7 +55,7 @@ class SceneState:
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _PlacedState:
     """A state with its instruments in their place, and what they do to the tissue that they touch."""
 
     state: SceneState
@@ -141,7 +141,7 @@ class Renderer:
         if not isinstance(content.tissue.material, Wet):
             raise ValueError("the tissue's material must be Wet")
         self._wet = content.tissue.material
-        self._static = joined(_NOTHING, *(body.shape for body in content.static))
+        self._static = join_shapes(_NOTHING, *(body.shape for body in content.static))
         metal = [(body, body.material) for body in content.static if isinstance(body.material, Metal)]
         # A face of metal at least, if out of sight: with and without instruments kernels are the same.
         self._static_metal = metal or (
@@ -172,40 +172,42 @@ class Renderer:
         """
         camera = state.camera or self.camera
         placed = self._place(state)
-        radiance, *others = self._gather([self._place(shot) for shot in shutter] or [placed], seed)
+        radiance, *right_radiances = self._gather([self._place(shot) for shot in shutter] or [placed], seed)
         faces = self.content.tissue.faces
         shapes = (Shape(state.vertices, faces), self._static, placed.posed)
-        own = truth.trace_frame(camera, self.rest, *shapes)
-        radiance = self._shade(radiance, own.hits, placed.share)
+        frame = truth.trace_frame(camera, self.rest, *shapes)
+        radiance = self._shade(radiance, frame.hits, placed.share)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
-            there = after or state
-            lens = there.camera or self.camera
-            extra["flow_next"] = truth.forward_flow(own.hits, faces, there.vertices, lens)
+            next_state = after or state
+            next_camera = next_state.camera or self.camera
+            extra["flow_next"] = truth.forward_flow(frame.hits, faces, next_state.vertices, next_camera)
         if "flow_next_all" in self._extra:
-            there = after or state
-            moved = joined(Shape(there.vertices, faces), self._static, self._posed(there))
-            lens = there.camera or self.camera
-            extra["flow_next_all"] = truth.forward_flow(own.hits, moved.faces, moved.vertices, lens)
+            next_state = after or state
+            scene = join_shapes(
+                Shape(next_state.vertices, faces), self._static, self._pose_instruments(next_state)
+            )
+            next_camera = next_state.camera or self.camera
+            extra["flow_next_all"] = truth.forward_flow(frame.hits, scene.faces, scene.vertices, next_camera)
         if "normals" in self._extra:
-            extra["normals"] = truth.normal_map(camera, own.hits, shapes)
+            extra["normals"] = truth.normal_map(camera, frame.hits, shapes)
         if "blur" in self._extra:
-            extra["blur"] = blur_radius(camera, own.depth)
-        extra |= self._shading(own.hits, shapes, "")
+            extra["blur"] = blur_radius(camera, frame.depth)
+        extra |= self._shading(frame.hits, shapes, "")
         if self._right_of is not None and self._right_rest is not None:
-            other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
-            picture = self.develop(self._shade(others[0], other.hits, placed.share), seed + 1)
-            extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
-            extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
-            extra |= self._shading(other.hits, shapes, "_right")
+            right = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
+            picture = self.develop(self._shade(right_radiances[0], right.hits, placed.share), seed + 1)
+            extra |= {"rgb_right": picture, "flow_right": right.flow, "visible_right": right.visible}
+            extra |= {"depth_right": right.depth, "tool_right": right.tool, "motion": frame.motion}
+            extra |= self._shading(right.hits, shapes, "_right")
         return RenderedFrame(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
-            flow=own.flow,
-            visible=own.visible,
-            depth=own.depth,
-            tool=own.tool,
-            glare=self._glare(radiance, own.hits, state),
+            flow=frame.flow,
+            visible=frame.visible,
+            depth=frame.depth,
+            tool=frame.tool,
+            glare=self._glare(radiance, frame.hits, state),
             **extra,
         )
 
@@ -217,9 +219,9 @@ class Renderer:
         """
         if self.right is None:
             raise ValueError("the scene is monocular")
-        on, found = self.rest.tissue, np.zeros(self.rest.tissue.shape, np.float32)
-        found[on] = disparity(self.camera, self.right, self.rest.points[on.ravel()])
-        return found
+        tissue, disparity_px = self.rest.tissue, np.zeros(self.rest.tissue.shape, np.float32)
+        disparity_px[tissue] = disparity(self.camera, self.right, self.rest.points[tissue.ravel()])
+        return disparity_px
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
@@ -229,14 +231,14 @@ class Renderer:
         """A Mitsuba stage of a state: bodies `tissue`, `metal`, and `static0` onwards."""
         return self._set_stage(self._place(state), spp, integrator)
 
-    def _set_stage(self, placed: _Placed, spp: int, integrator: str = "direct") -> Stage:
+    def _set_stage(self, placed: _PlacedState, spp: int, integrator: str = "direct") -> Stage:
         vertices = placed.state.vertices
         tissue = self.content.tissue
         if (hidden := self.content.hidden) is not None:
             tissue = replace(tissue, faces=tissue.faces[~hidden])
         bodies = {"tissue": replace(tissue, vertices=vertices, film=placed.film)}
-        wet = (body for body in self.content.static if isinstance(body.material, Wet))
-        bodies |= {f"static{k}": body for k, body in enumerate(wet)}
+        wet_bodies = (body for body in self.content.static if isinstance(body.material, Wet))
+        bodies |= {f"static{k}": body for k, body in enumerate(wet_bodies)}
         shape, glow = self._metal(placed.posed)
         textures = [(body.uv, metal.maps) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
@@ -249,7 +251,7 @@ class Renderer:
         """Moves a stage to another state."""
         self._move(stage, self._place(state))
 
-    def _move(self, stage: Stage, placed: _Placed) -> None:
+    def _move(self, stage: Stage, placed: _PlacedState) -> None:
         stage.move("tissue", placed.state.vertices, film=placed.film)
         if self.content.instruments is not None:
             shape, glow = self._metal(placed.posed)
@@ -259,29 +261,29 @@ class Renderer:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
         return camera_sensor.record(radiance, self._sensor, np.random.default_rng([seed, 1]))
 
-    def _posed(self, state: SceneState) -> Shape:
+    def _pose_instruments(self, state: SceneState) -> Shape:
         """The instruments."""
         instruments = self.content.instruments
         return _NOTHING if instruments is None else instruments.pose(state.tips, state.shafts)
 
     def _shading(self, hits: truth.Hits, shapes: Sequence[Shape], camera: str) -> dict[str, Array]:
         """Optional fields of instruments and shadows at a camera's hits of shapes, instruments last."""
-        found: dict[str, Array] = {}
+        arrays: dict[str, Array] = {}
         if (name := f"shadow{camera}") in self._extra:
-            found[name] = shadow_map(hits, shapes, self.content.lamps, self.camera.size)
+            arrays[name] = shadow_map(hits, shapes, self.content.lamps, self.camera.size)
         if (name := f"instrument{camera}") in self._extra:
             instruments, size = self.content.instruments, self.camera.size[::-1]
             owner = np.zeros(0, int) if instruments is None else instruments.owner
             first = sum(len(shape.faces) for shape in shapes[:-1])
             number = np.concatenate([np.zeros(first, np.uint8), (owner + 1).astype(np.uint8), [np.uint8(0)]])
-            found[name] = number[hits.face].reshape(size)  # the last one is that of no hit, face -1
-        return found
+            arrays[name] = number[hits.face].reshape(size)  # the last one is that of no hit, face -1
+        return arrays
 
-    def _place(self, state: SceneState) -> _Placed:
-        posed, instruments = self._posed(state), self.content.instruments
+    def _place(self, state: SceneState) -> _PlacedState:
+        posed, instruments = self._pose_instruments(state), self.content.instruments
         if instruments is None:
-            return _Placed(state, posed)
-        return _Placed(state, posed, *instruments.touch(posed, state.vertices))
+            return _PlacedState(state, posed)
+        return _PlacedState(state, posed, *instruments.touch(posed, state.vertices))
 
     def _shade(self, radiance: Map, hits: truth.Hits, shade: Floats | None) -> Map:
         """The radiance (H, W, 3) less the light that contacts take from the tissue.
@@ -293,17 +295,17 @@ class Renderer:
             return radiance
         faces = self.content.tissue.faces
         # Of the pixels on tissue, those on a face with a shaded corner.
-        dark = np.append((shade < _UNSHADED)[faces].any(axis=1), False)
-        near = np.flatnonzero(dark[np.where(hits.face < len(faces), hits.face, -1)])
-        share = truth.blend(faces, hits.face[near], hits.bary[near], shade[:, None])
-        shaded = radiance.reshape(-1, 3).copy()
-        shaded[near] *= share.astype(np.float32)
-        return shaded.reshape(radiance.shape)
+        is_shaded = np.append((shade < _UNSHADED)[faces].any(axis=1), False)
+        pixels = np.flatnonzero(is_shaded[np.where(hits.face < len(faces), hits.face, -1)])
+        share = truth.blend(faces, hits.face[pixels], hits.bary[pixels], shade[:, None])
+        result = radiance.reshape(-1, 3).copy()
+        result[pixels] *= share.astype(np.float32)
+        return result.reshape(radiance.shape)
 
-    def _gather(self, every: Sequence[_Placed], seed: int) -> list[Map]:
+    def _gather(self, states: Sequence[_PlacedState], seed: int) -> list[Map]:
         """Mean radiance over some states, in the camera and in the right one if there is one."""
         shots: list[list[Map]] = []
-        for k, placed in enumerate(every):
+        for k, placed in enumerate(states):
             state = placed.state
             if self._stage is None:
                 self._stage = self._set_stage(placed, self._spp)
@@ -314,9 +316,9 @@ class Renderer:
                 cameras.append(self._right_of(cameras[0]))
             shots.append([])
             for side, camera in enumerate(cameras):
-                taken = self._stage.render((seed + side + 7919 * k) % 2**32, camera)
-                shots[-1].append(np.float32(state.power) * (taken * self._spot(camera)[..., None]))
-        return [np.asarray(np.mean(taken, axis=0), np.float32) for taken in zip(*shots, strict=True)]
+                radiance = self._stage.render((seed + side + 7919 * k) % 2**32, camera)
+                shots[-1].append(np.float32(state.power) * (radiance * self._spot(camera)[..., None]))
+        return [np.asarray(np.mean(exposures, axis=0), np.float32) for exposures in zip(*shots, strict=True)]
 
     def _spot(self, camera: Camera) -> Map:
         if camera is self.camera:
@@ -332,7 +334,7 @@ class Renderer:
         parts = [(body.shape, metal.glow) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
             parts.insert(0, (posed, instruments.glow(posed)))
-        return joined(*(shape for shape, _ in parts)), np.concatenate([glow for _, glow in parts])
+        return join_shapes(*(shape for shape, _ in parts)), np.concatenate([glow for _, glow in parts])
 
     def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""
@@ -340,22 +342,22 @@ class Renderer:
         tissue = self.content.tissue
         level = _mean(radiance.reshape(-1, 3)) * self._sensor.exposure
         # Of darker pixels, which are most, the diffuse part doesn't matter.
-        on = np.flatnonzero((hits.face >= 0) & (hits.face < len(tissue.faces)) & (level > _GLARE))
-        face, bary = hits.face[on], hits.bary[on]
+        pixels = np.flatnonzero((hits.face >= 0) & (hits.face < len(tissue.faces)) & (level > _GLARE))
+        face, bary = hits.face[pixels], hits.bary[pixels]
         uv = truth.blend(tissue.faces, face, bary, tissue.uv)
         albedo = noise.sample(self._wet.maps.albedo, uv - 0.5, 1.0)
         normal = normals(Shape(state.vertices, tissue.faces))
         irradiance = np.zeros((len(normal), 3))  # as radiance of a white diffuser at vertices, unshadowed
         for lamp in self.content.lamps:
             ray = lamp.position - state.vertices
-            square = np.einsum("vc,vc->v", ray, ray)
-            facing = np.maximum(np.einsum("vc,vc->v", normal, ray) / np.sqrt(square), 0)
-            irradiance += (facing / (np.pi * square))[:, None] * lamp.intensity
+            distance2 = np.einsum("vc,vc->v", ray, ray)
+            facing = np.maximum(np.einsum("vc,vc->v", normal, ray) / np.sqrt(distance2), 0)
+            irradiance += (facing / (np.pi * distance2))[:, None] * lamp.intensity
         light_in = truth.blend(tissue.faces, face, bary, state.power * irradiance)
-        spot = self._spot(state.camera or self.camera).ravel()[on]
+        spot = self._spot(state.camera or self.camera).ravel()[pixels]
         diffuse = spot * _mean(albedo * light_in)
         glare = np.zeros(height * width, bool)
-        glare[on] = level[on] - 1.05 * self._sensor.exposure * diffuse > _GLARE
+        glare[pixels] = level[pixels] - 1.05 * self._sensor.exposure * diffuse > _GLARE
         return glare.reshape(height, width)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from synth.arrays import Floats, Map
-from synth.geometry.triangles import Shape, grid_faces, joined
+from synth.geometry.triangles import Shape, grid_faces, join_shapes
 from synth.render import instrument
 from synth.render.anatomy.layers import Rgb
 from synth.render.anatomy.rim import Rim
@@ -46,14 +46,14 @@ _STRING_MM = 0.13  # its radius
 def build_retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int, mm_per_px: float) -> Body:
     """A straight blade on the rim, its end over the opening's edge, of radii (A,) mm at even angles."""
     rng = np.random.default_rng([seed, 5])
-    turn, lean, inside, wide = rng.uniform((0, 0.1, 1.5, 3.5), (2 * np.pi, 0.2, 3.5, 5.2))
-    parts, half = instrument.shape_of("spatula", float(wide))
-    out, up = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([0.0, 0.0, 1.0])
-    start = float(edge[int(turn / (2 * np.pi) * len(edge))]) - inside
-    along, aside = ground @ out - start, np.abs(ground @ np.cross(up, out))
-    under = (along > 0) & (aside < half + 0.5)
-    high = float((ground[under, 2] - np.tan(lean) * along[under]).max()) + 0.5
-    tip, shaft = start * out + high * up, np.cos(lean) * out + np.sin(lean) * up
+    turn, tilt, overlap_mm, width = rng.uniform((0, 0.1, 1.5, 3.5), (2 * np.pi, 0.2, 3.5, 5.2))
+    parts, half = instrument.shape_of("spatula", float(width))
+    direction, up = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([0.0, 0.0, 1.0])
+    start = float(edge[int(turn / (2 * np.pi) * len(edge))]) - overlap_mm
+    along, aside = ground @ direction - start, np.abs(ground @ np.cross(up, direction))
+    is_under = (along > 0) & (aside < half + 0.5)
+    height = float((ground[is_under, 2] - np.tan(tilt) * along[is_under]).max()) + 0.5
+    tip, shaft = start * direction + height * up, np.cos(tilt) * direction + np.sin(tilt) * up
     maps = parts[0].maps(_DULL, "spatula", rng, mm_per_px)
     (vertices,) = instrument.place(parts, np.stack([tip, tip]), np.stack([shaft, shaft]))
     blade = Shape(vertices, parts[0].shape.faces)
@@ -77,10 +77,10 @@ def build_clips(
         turn = first + 2 * np.pi * group / count + rng.normal(0, 0.25)
         middles = list[Floats]()
         for _ in range(rng.integers(*_TOGETHER)):
-            away = scale * (_behind(rim, rim.skin, turn) + _BEHIND_MM)
-            turn += (_CLIP_MM[0] + _GAP_MM) / away
+            distance = scale * (_find_radius(rim, rim.skin, turn) + _BEHIND_MM)
+            turn += (_CLIP_MM[0] + _GAP_MM) / distance
             skew, blood = float(rng.normal(0, 0.12)), float(rng.uniform(0.0, 0.14))
-            middle = _rest(ground, away * _outwards(turn), 0.1 * _CLIP_MM[1])
+            middle = _set_on_ground(ground, distance * _direction(turn), 0.1 * _CLIP_MM[1])
             # On the highest of what it would cut into.
             below = ground[np.hypot(*(ground - middle)[:, :2].T) < _CLIP_MM[1]]
             middle[2] = max(middle[2], float(np.percentile(below[:, 2], 95)) if len(below) else -np.inf)
@@ -108,19 +108,19 @@ def build_hooks(
     bars = list[Bar]()
     turns = rng.uniform(0, 2 * np.pi) + np.arange(n := rng.integers(*_HOOKS)) * 2 * np.pi / n
     for turn in turns + rng.normal(0, 0.3, n):
-        out = _outwards(float(turn) + float(rng.normal(0, 0.15)))
-        held = scale * (_behind(rim, rim.skin, float(turn)) - 0.6)
-        foot = _rest(ground, held * _outwards(float(turn)), 0.0)
+        direction = _direction(float(turn) + float(rng.normal(0, 0.15)))
+        distance = scale * (_find_radius(rim, rim.skin, float(turn)) - 0.6)
+        foot = _set_on_ground(ground, distance * _direction(float(turn)), 0.0)
         if not _in_view(camera, foot):
             continue
         # From inside the wound over its edge, then down to the skin and straight out of view.
-        crest = _rest(ground, foot + 1.6 * out, 0.9)
+        crest = _set_on_ground(ground, foot + 1.6 * direction, 0.9)
         bend = np.linspace(-0.6, 0.5, 9)[:, None] * np.pi
-        start = foot + 0.6 * out
-        high = max(float(crest[2] - foot[2]), 0.8)
-        arc = start + 1.1 * np.sin(bend) * out + [0, 0, 1] * (high * np.cos(bend) - 0.1)
-        far = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * np.array([*out[:2], 0.12])
-        path = np.concatenate([arc, far])
+        start = foot + 0.6 * direction
+        height = max(float(crest[2] - foot[2]), 0.8)
+        arc = start + 1.1 * np.sin(bend) * direction + [0, 0, 1] * (height * np.cos(bend) - 0.1)
+        tail = arc[-1] + np.linspace(0.8, 14.0, 5)[:, None] * np.array([*direction[:2], 0.12])
+        path = np.concatenate([arc, tail])
         steel = replace(_WIRE, blood=float(rng.uniform(0, 0.4)))
         bars.append(Bar(wire(path, _HOOK_MM), 8, path, steel, "hook"))
     return _bodies(bars, theatre, rng, camera.mm_per_px)
@@ -135,25 +135,31 @@ def build_patties(
     bodies, bars = list[Body](), list[Bar]()
     for _ in range(rng.integers(*_PATTIES)):
         turn, half = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(*_PATTY_MM))
-        skew, inside = float(rng.normal(0, 0.5)), float(rng.uniform(*_INSIDE_MM))
-        lean = _outwards(turn + skew)
-        middle = (scale * _behind(rim, 0 * rim.skin, turn) - inside) * _outwards(turn) + half * lean
-        if not _in_view(camera, _rest(ground, middle, 0.0)):
+        skew, overlap_mm = float(rng.normal(0, 0.5)), float(rng.uniform(*_INSIDE_MM))
+        direction = _direction(turn + skew)
+        middle = (scale * _find_radius(rim, 0 * rim.skin, turn) - overlap_mm) * _direction(
+            turn
+        ) + half * direction
+        if not _in_view(camera, _set_on_ground(ground, middle, 0.0)):
             continue
-        (x, y, _), tip = lean.tolist(), (float(middle[0]), float(middle[1]), 0.0)
+        (x, y, _), tip = direction.tolist(), (float(middle[0]), float(middle[1]), 0.0)
         cloth = IdleInstrument("patty", half, tip, (0.0, 0.0, 1.0), (x, y, 0.0), gap_mm=1e-3)
         part = instrument.lay_cloth(cloth, ground, rng)
         (vertices,) = instrument.place([part], *cloth.at(0.0))
-        soaked = float(rng.uniform(0.0, 0.22))
-        felt = replace(draw_finish(0.0, rng, "patty"), blood=soaked, blood_mm=0.6 * half)
+        blood = float(rng.uniform(0.0, 0.22))
+        felt = replace(draw_finish(0.0, rng, "patty"), blood=blood, blood_mm=0.6 * half)
         maps = part.maps(felt, "patty", rng, camera.mm_per_px)
         sheet = Shape(vertices, part.shape.faces)
         bodies.append(_body(sheet, part.uv, maps, theatre, np.full(len(vertices), 0.9)))
-        start, curl = middle + 0.9 * half * lean, rng.normal(0, 0.5, 2)
+        start, curl = middle + 0.9 * half * direction, rng.normal(0, 0.5, 2)
         s = np.linspace(0, 1, 18)[:, None]
-        side = np.array([-lean[1], lean[0], 0.0])
-        flat = start + 16 * s * lean + side * (16 * (curl[0] * s**2 + 0.3 * curl[1] * np.sin(2 * np.pi * s)))
-        path = np.stack([_rest(ground, point, 0.35) for point in flat])
+        side = np.array([-direction[1], direction[0], 0.0])
+        points = (
+            start
+            + 16 * s * direction
+            + side * (16 * (curl[0] * s**2 + 0.3 * curl[1] * np.sin(2 * np.pi * s)))
+        )
+        path = np.stack([_set_on_ground(ground, point, 0.35) for point in points])
         path[:, 2] = gaussian_filter1d(path[:, 2], 1.0, mode="nearest") + 0.15
         thread = Finish((0.5, 0.5, 0.5), 0.5, coat=string, coat_alpha=0.5, bare_mm=-1.0)
         bars.append(Bar(wire(path, _STRING_MM), 4, path, thread, "string"))
@@ -180,22 +186,22 @@ class Bar:
 
     @property
     def shape(self) -> Shape:
-        ahead = np.gradient(self.path, axis=0)
+        tangents = np.gradient(self.path, axis=0)
         # Two rings in one place close an end: without a direction the outer one would fall flat, into faces
         # without area, whose light is undefined.
         for end, inner in ((0, 1), (-1, -2)):
-            if not ahead[end].any():
-                ahead[end] = ahead[inner]
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+            if not tangents[end].any():
+                tangents[end] = tangents[inner]
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
         # Upwards where it is level, so that the shown half of its texture faces the microscope.
-        aside = np.cross(ahead, [0.0, 0.0, 1.0])
-        level = np.linalg.norm(aside, axis=1, keepdims=True)
-        mean = aside.sum(axis=0) / max(float(np.linalg.norm(aside.sum(axis=0))), 1e-9)
-        aside = np.where(level > 0.1, aside / np.maximum(level, 1e-9), mean)
-        up = np.cross(aside, ahead)
+        normals = np.cross(tangents, [0.0, 0.0, 1.0])
+        level = np.linalg.norm(normals, axis=1, keepdims=True)
+        mean = normals.sum(axis=0) / max(float(np.linalg.norm(normals.sum(axis=0))), 1e-9)
+        normals = np.where(level > 0.1, normals / np.maximum(level, 1e-9), mean)
+        up = np.cross(normals, tangents)
         rings = self.part.profile.reshape(len(self.path), RING, 3)[:, :: RING // self.sides]
-        placed = self.path[:, None] + rings[..., :1] * up[:, None] + rings[..., 1:2] * aside[:, None]
-        return Shape(placed.reshape(-1, 3), grid_faces(len(rings), self.sides, "columns").reshape(-1, 3))
+        points = self.path[:, None] + rings[..., :1] * up[:, None] + rings[..., 1:2] * normals[:, None]
+        return Shape(points.reshape(-1, 3), grid_faces(len(rings), self.sides, "columns").reshape(-1, 3))
 
     @property
     def uv(self) -> Map:
@@ -207,11 +213,11 @@ def _bodies(bars: list[Bar], theatre: Theatre, rng: np.random.Generator, mm_per_
     """All bars as one body, or none."""
     if not bars:
         return []
-    whole = joined(*(bar.shape for bar in bars))
+    shape = join_shapes(*(bar.shape for bar in bars))
     textures = [(bar.uv, bar.part.maps(bar.finish, bar.kind, rng, mm_per_px)) for bar in bars]
     uv, maps = stack_maps(textures)
     alpha = np.concatenate([np.full(len(bar.uv), bar.finish.alpha) for bar in bars])
-    return [_body(whole, uv, maps, theatre, alpha)]
+    return [_body(shape, uv, maps, theatre, alpha)]
 
 
 def _body(shape: Shape, uv: Map, maps: FinishMaps, theatre: Theatre, alpha: Floats) -> Body:
@@ -219,20 +225,20 @@ def _body(shape: Shape, uv: Map, maps: FinishMaps, theatre: Theatre, alpha: Floa
     return Body(*shape, uv, Metal(maps, reflection.glow(shape, alpha, bare, theatre)))
 
 
-def _outwards(turn: float) -> Floats:
+def _direction(turn: float) -> Floats:
     return np.array([np.cos(turn), np.sin(turn), 0.0])
 
 
-def _behind(rim: Rim, beyond: Floats, turn: float) -> float:
+def _find_radius(rim: Rim, beyond: Floats, turn: float) -> float:
     """Distance [mm] from the middle, in the rim's size, of an outline (A,) `beyond` the opening's edge."""
     place = int(turn % (2 * np.pi) / (2 * np.pi) * len(rim.edge)) % len(rim.edge)
     return float(rim.edge[place] + beyond[place])
 
 
-def _rest(ground: Floats, point: Floats, above: float) -> Floats:
+def _set_on_ground(ground: Floats, point: Floats, above: float) -> Floats:
     """The point (3,) mm set on the ground's points (N, 3), or `above` it."""
-    near = np.argsort(((ground[:, :2] - point[:2]) ** 2).sum(axis=1))[:12]
-    return np.array([point[0], point[1], float(ground[near, 2].max()) + above])
+    neighbours = np.argsort(((ground[:, :2] - point[:2]) ** 2).sum(axis=1))[:12]
+    return np.array([point[0], point[1], float(ground[neighbours, 2].max()) + above])
 
 
 def _in_view(camera: Camera, point: Floats) -> bool:
@@ -250,18 +256,18 @@ def wire(path: Floats, radius: float) -> Part:
 
 def _fold(middles: Floats, ground: Floats, rng: np.random.Generator) -> Bar:
     """The fold of cut skin that clips at `middles` (n, 3) mm, along a line, grip: it sinks in beyond them."""
-    share, rings, uneven = _FOLD
-    ahead = middles[-1] - middles[0] if len(middles) > 1 else np.cross([0.0, 0.0, 1.0], middles[0])
-    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-    ends = [middles[k] + side * 1.1 * _CLIP_MM[0] * ahead for k, side in ((0, -1), (-1, 1))]
+    share, rings, unevenness = _FOLD
+    direction = middles[-1] - middles[0] if len(middles) > 1 else np.cross([0.0, 0.0, 1.0], middles[0])
+    direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    ends = [middles[k] + side * 1.1 * _CLIP_MM[0] * direction for k, side in ((0, -1), (-1, 1))]
     stops = np.array([ends[0], *middles, ends[1]])
     for end in (0, -1):
-        stops[end] = _rest(ground, stops[end], -0.9 * _CLIP_MM[1])
+        stops[end] = _set_on_ground(ground, stops[end], -0.9 * _CLIP_MM[1])
     run = np.append(0, np.linalg.norm(np.diff(stops, axis=0), axis=1).cumsum())
     s = np.linspace(0, run[-1], rings)
     path = gaussian_filter1d(np.stack([np.interp(s, run, axis) for axis in stops.T], axis=1), 1.0, axis=0)
     wave = gaussian_filter1d(rng.standard_normal(rings), 1.5)
-    r = share * _CLIP_MM[1] * np.clip(1 + uneven * wave / max(float(wave.std()), 1e-9), 0.7, 1.12)
+    r = share * _CLIP_MM[1] * np.clip(1 + unevenness * wave / max(float(wave.std()), 1e-9), 0.7, 1.12)
     r[[0, -1]] *= 0.05
     flesh = replace(_FLESH, blood=float(rng.uniform(0.1, 0.5)), blood_mm=float(run[-1]))
     return Bar(Part(instrument.sweep(s, r, r, np.zeros_like(s), 0.9), 0), 16, path, flesh, "fold")

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.arrays import Array, Floats, Indices, Ints, Map, Mask
-from synth.geometry.triangles import Shape, joined, lengths, normals
+from synth.geometry.triangles import Shape, join_shapes, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
 from synth.system.jit import argument_types, as_constant, compiled
@@ -103,7 +103,7 @@ def trace_rest(camera: Camera, surface: Shape, static: Shape) -> RestFrame:
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = cameras.rays(camera, pixels)
-    hits = ProjectedScene.of(camera, joined(surface, static)).cast(None, directions)
+    hits = ProjectedScene.of(camera, join_shapes(surface, static)).cast(None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
     corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
@@ -123,21 +123,23 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
     instruments in this frame, and what never moves."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
-    scene = ProjectedScene.of(camera, joined(surface, static, tool))
+    scene = ProjectedScene.of(camera, join_shapes(surface, static, tool))
     hits = scene.cast(None, rest.directions)
     depth = np.where(hits.face >= 0, hits.along, 0.0)  # directions have unit z
 
-    on = rest.tissue.ravel()
-    carried = blend(surface.faces, rest.face.ravel()[on], rest.bary.reshape(-1, 3)[on], surface.vertices)
-    local = cameras.to_camera(camera, carried)
-    pierced = cameras.to_pixels(camera, local)
-    blocked = scene.cast(pierced, local)
-    clear = (1 - blocked.along) * lengths(local) < _HIDDEN_MM
-    inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
+    tissue = rest.tissue.ravel()
+    points = blend(
+        surface.faces, rest.face.ravel()[tissue], rest.bary.reshape(-1, 3)[tissue], surface.vertices
+    )
+    local = cameras.to_camera(camera, points)
+    positions = cameras.to_pixels(camera, local)
+    first_hits = scene.cast(positions, local)
+    unhidden = (1 - first_hits.along) * lengths(local) < _HIDDEN_MM
+    inside = ((positions >= -0.5) & (positions < np.array([width, height]) - 0.5)).all(axis=1)
     return FrameTruth(
-        flow=_picture(on, pierced - pixels[on], camera),
-        motion=_picture(on, local - rest.points[on], camera),
-        visible=_picture(on, clear & inside, camera, bool),
+        flow=_picture(tissue, positions - pixels[tissue], camera),
+        motion=_picture(tissue, local - rest.points[tissue], camera),
+        visible=_picture(tissue, unhidden & inside, camera, bool),
         depth=depth.reshape(height, width).astype(np.float32),
         tool=(hits.face >= len(surface.faces) + len(static.faces)).reshape(height, width),
         hits=hits,
@@ -147,17 +149,17 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
 def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> Map:
     """Flow (H, W, 2) px from each pixel of one frame, by its hits, the surface's faces first, to another
     frame, by the surface's vertices (V, 3) mm and the camera in it; 0 off the surface."""
-    on = (hits.face >= 0) & (hits.face < len(faces))
-    points = blend(faces, hits.face[on], hits.bary[on], vertices)
-    return _picture(on, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on], camera)
+    mask = (hits.face >= 0) & (hits.face < len(faces))
+    points = blend(faces, hits.face[mask], hits.bary[mask], vertices)
+    return _picture(mask, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[mask], camera)
 
 
 def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> Map:
     """Smoothed unit normals (H, W, 3), camera axes, at hits of shapes; 0 where there is nothing."""
     vertex = np.concatenate([normals(shape) for shape in shapes]) @ camera.rotation.T
-    on = hits.face >= 0
-    smooth = blend(joined(*shapes).faces, hits.face[on], hits.bary[on], vertex)
-    return _picture(on, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), camera)
+    mask = hits.face >= 0
+    vectors = blend(join_shapes(*shapes).faces, hits.face[mask], hits.bary[mask], vertex)
+    return _picture(mask, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12), camera)
 
 
 def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> Map:
@@ -172,27 +174,29 @@ def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.flo
     return _blend(as_constant(faces), face, bary, np.ascontiguousarray(nodal, np.float64))
 
 
-def _picture(on: Mask, values: Array, camera: Camera, kind: type = np.float32) -> Array:
-    """Values (M, ...) of the pixels that are `on` (H*W,) as a picture (H, W, ...); 0 elsewhere."""
-    found = np.zeros((len(on), *values.shape[1:]), kind)
-    found[on] = values
-    return found.reshape(*camera.size[::-1], *values.shape[1:])
+def _picture(mask: Mask, values: Array, camera: Camera, kind: type = np.float32) -> Array:
+    """Values (M, ...) of the pixels in `mask` (H*W,) as a picture (H, W, ...); 0 elsewhere."""
+    picture = np.zeros((len(mask), *values.shape[1:]), kind)
+    picture[mask] = values
+    return picture.reshape(*camera.size[::-1], *values.shape[1:])
 
 
-def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, along: Floats) -> Floats:
-    """Area (M,) mm2 of the faces' planes in each pixel of `on`, from the spread of its rays."""
+def _footprint(camera: Camera, corners: Floats, directions: Floats, mask: Mask, along: Floats) -> Floats:
+    """Area (M,) mm2 of the faces' planes in each pixel of `mask`, from the spread of its rays."""
     width, height = camera.size
     grid = cameras.pixel_grid((width + 1, height + 1)) - 0.5
     corner = cameras.rays(camera, grid).reshape(height + 1, width + 1, 3)
     across = 0.5 * ((corner[:-1, 1:] - corner[:-1, :-1]) + (corner[1:, 1:] - corner[1:, :-1]))
     down = 0.5 * ((corner[1:, :-1] - corner[:-1, :-1]) + (corner[1:, 1:] - corner[:-1, 1:]))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    ray = directions[on]
+    ray = directions[mask]
     facing = np.einsum("nc,nc->n", normal, ray)[:, None]
-    sides = (across.reshape(-1, 3)[on], down.reshape(-1, 3)[on])
+    sides = (across.reshape(-1, 3)[mask], down.reshape(-1, 3)[mask])
     slopes = (np.einsum("nc,nc->n", normal, side)[:, None] / facing for side in sides)
-    one, other = (along[on, None] * (side - ray * slope) for side, slope in zip(sides, slopes, strict=True))
-    return np.asarray(np.linalg.norm(np.cross(one, other), axis=1))
+    side_a, side_b = (
+        along[mask, None] * (side - ray * slope) for side, slope in zip(sides, slopes, strict=True)
+    )
+    return np.asarray(np.linalg.norm(np.cross(side_a, side_b), axis=1))
 
 
 @argument_types("f8[:,::1], f8[:,::1], i4[:,::1], f8[:,::1], i8[::1], i8[::1], UniTuple(i8, 2)")
@@ -260,12 +264,12 @@ def _cast(
 @argument_types("Array(i4, 2, 'C', readonly=True), i4[::1], f8[:,::1], f8[:,::1]")
 @compiled
 def _blend(faces: Indices, face: Indices, bary: Floats, nodal: Floats) -> Floats:
-    found = np.zeros((len(face), nodal.shape[1]))
+    out = np.zeros((len(face), nodal.shape[1]))
     for n in range(len(face)):
         if face[n] < 0 or face[n] >= len(faces):
             continue
         a, b, c = faces[face[n]]
         u, v, w = bary[n, 0], bary[n, 1], bary[n, 2]
         for k in range(nodal.shape[1]):
-            found[n, k] = u * nodal[a, k] + v * nodal[b, k] + w * nodal[c, k]
-    return found
+            out[n, k] = u * nodal[a, k] + v * nodal[b, k] + w * nodal[c, k]
+    return out

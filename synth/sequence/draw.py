@@ -109,8 +109,8 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
     if lens.K is not None:
         case = replace(case, view=cameras.state_field(case.view, camera))
     if job.mechanics.source is not None:  # whose files hold motion and load
-        outside = replace(case.tissue, law="external", why="mechanics.source", membrane=None)
-        case = replace(case, gestures=(), pulse=None, tissue=outside)
+        external_tissue = replace(case.tissue, law="external", why="mechanics.source", membrane=None)
+        case = replace(case, gestures=(), pulse=None, tissue=external_tissue)
     craniotomy, attachments = open_skull(job.anatomy, case.index)
     return Draw(
         index=index,
@@ -130,16 +130,16 @@ def _draw_case(
     job: Job,
     number: tuple[int, int],
     lens: Lens,
-    varied: tuple[Randomization | None, tuple[float, float]],
+    variation: tuple[Randomization | None, tuple[float, float]],
     generator: Callable[..., np.random.Generator],
 ) -> tuple[Scenario, Camera]:
     """A sequence's scenario, and its camera.
 
-    `number`: index and attempt; `varied`: of `randomization.randomize`; `generator`: of the numbers of a
+    `number`: index and attempt; `variation`: of `randomization.randomize`; `generator`: of the numbers of a
     sequence's part.
     """
     index, attempt = number
-    randomized, off_centre = varied
+    randomized, off_centre = variation
     family = job.appearance.families[index % len(job.appearance.families)]
     fem = job.fem.of_contact(scenario.choose(generator(_CONTACT), job.fem.contact))
     relief = np.random.default_rng(SeedSequence(job.seed, spawn_key=(_ANATOMY, index, 0)))
@@ -159,11 +159,11 @@ def _draw_case(
     view, appearance = randomization.vary(case.view, case.appearance, job, index, lens, off_centre)
     camera = cameras.place(view, lens)
     visible_mm, opening_mm = visible_radius(camera), job.anatomy.craniotomy.radius_mm
-    again = (_REDRAW, attempt) if attempt else ()
-    rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-    shown = visible_mm, camera.centre
+    redraw_key = (_REDRAW, attempt) if attempt else ()
+    rngs = generator(*redraw_key, _GESTURE), generator(*redraw_key, _FURTHER)
+    sight = visible_mm, camera.centre
     young_kpa = case.tissue.young_kpa
-    gestures = scenario.draw_gestures(fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
+    gestures = scenario.draw_gestures(fem, opening_mm, young_kpa, *rngs, *sight, job.frames)
     lines = [[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]
     acting = np.array(lines).reshape(-1, 2, 3)
     strength = job.randomize.get("instruments", 0.0)
@@ -196,15 +196,15 @@ def read_scheme(fem: FemSection) -> TimeScheme:
 
 def open_skull(anatomy: AnatomySection, index: int) -> tuple[Craniotomy | None, tuple[Attachment, ...]]:
     """The opening of sequence `index` in a given surface, None for a block, and what holds tissue inside."""
-    where = anatomy.opened(index).craniotomy
+    craniotomy = anatomy.select_opening(index).craniotomy
     opening = None
-    if where.point is not None and where.direction is not None:
-        opening = Craniotomy(where.point, where.direction, where.radius_mm)
-    held = (
+    if craniotomy.point is not None and craniotomy.direction is not None:
+        opening = Craniotomy(craniotomy.point, craniotomy.direction, craniotomy.radius_mm)
+    attachments = (
         Attachment(attachment.point, attachment.radius_mm, attachment.normal, attachment.thickness_mm)
         for attachment in anatomy.attachments
     )
-    return opening, tuple(held)
+    return opening, tuple(attachments)
 
 
 def refuse_unfit(render: RenderSection) -> None:
@@ -226,7 +226,7 @@ def place_right(render: RenderSection, camera: Camera) -> Callable[[Camera], Cam
         return partial(cameras.right_camera, baseline_mm=render.stereo_mm)
     with as_user_error("render.calibration"):
         pair = read_rig(render.calibration, render.size)
-    distortion = camera_calibration.rendered(pair.right.distortion, render.calibration)
+    distortion = camera_calibration.trim_distortion(pair.right.distortion, render.calibration)
     Rectified(pair)  # refuses a right camera that is not to the right
     place = partial(_place_pair, pair=pair, distortion=distortion)
     right = place(camera)
@@ -242,7 +242,7 @@ def place_right(render: RenderSection, camera: Camera) -> Callable[[Camera], Cam
 def _place_pair(camera: Camera, pair: StereoRig, distortion: np.ndarray) -> Camera:
     """The right camera of a calibrated pair; the left one's picture may have another size than the pair's."""
     scale = np.diag(camera.K)[:2] / np.diag(pair.left.K)[:2]
-    K = camera_calibration.scaled(pair.right.K, scale)
-    return cameras.calibrated_right(
+    K = camera_calibration.scale_intrinsics(pair.right.K, scale)
+    return cameras.place_right(
         camera, K=K, distortion=distortion, rotation=pair.rotation, translation=pair.translation
     )

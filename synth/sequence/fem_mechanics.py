@@ -33,13 +33,13 @@ class FemMechanics:
     def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
         """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
         motions = self.motions and check_motions(self.motions, rest.scenario.gestures, rest.job.frames)
-        drawn, case, job = rest.draw, rest.scenario, rest.job
+        draw, case, job = rest.draw, rest.scenario, rest.job
         with watch.stage("mesh"):
             tets = build_volume(rest)
         report("fem", 0, 1)
         with watch.stage("fem"):
             return solver.deform(
-                drawn.scheme,
+                draw.scheme,
                 case.tissue,
                 case.gestures,
                 tets,
@@ -47,7 +47,7 @@ class FemMechanics:
                 job.frames,
                 job.fps,
                 case.pulse,
-                drawn.opening_mm,
+                draw.opening_mm,
                 motions,
                 self.inside,
             )
@@ -55,14 +55,14 @@ class FemMechanics:
 
 def build_volume(rest: RestScene) -> Tets:
     """The volume under the surface, meshed finest under the contacts. UserError: it can't be meshed."""
-    drawn, surface, count = rest.draw, rest.surface, rest.job.fem.tets
+    draw, surface, count = rest.draw, rest.surface, rest.job.fem.tets
     focus = tuple(place for gesture in rest.scenario.gestures for place in gesture.focus)
-    slips, opening_mm = rest.scenario.tissue.skull == "slip", drawn.opening_mm
+    slips, opening_mm = rest.scenario.tissue.skull == "slip", draw.opening_mm
     if (brain := rest.brain) is not None:
         mesh = partial(tetrahedra.from_brain, brain, count, focus, opening_mm=opening_mm, slips=slips)
         return _VOLUMES.get(mesh, brain, count, focus, opening_mm, slips)
     height = HeightMap(surface.pia, surface.extent_mm)
-    width, length, depth = (drawn.scale * side for side in tetrahedra.BLOCK_MM)
+    width, length, depth = (draw.scale * side for side in tetrahedra.BLOCK_MM)
     block = partial(
         tetrahedra.block,
         count,
@@ -70,7 +70,7 @@ def build_volume(rest: RestScene) -> Tets:
         height,
         opening_mm=opening_mm,
         dome_mm=rest.job.anatomy.dome_mm,
-        attachments=drawn.attachments,
+        attachments=draw.attachments,
         slips=slips,
         size_mm=(width, length, depth),
     )

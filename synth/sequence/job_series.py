@@ -16,15 +16,15 @@ def read_job_series(job: Job, index: int) -> MeshSeries:
 
     UserError: its files can't be used, or are replaced while they are read.
     """
-    given, fem = job.mechanics, job.fem
-    assert given.source is not None
-    sources = series_files.list_sources(given.source)
+    mechanics, fem = job.mechanics, job.fem
+    assert mechanics.source is not None
+    sources = series_files.list_sources(mechanics.source)
     pulls = not _PULLING.isdisjoint(fem.names) or bool(fem.own_instruments)
     return read_checked_series(
         sources[index % len(sources)],
-        Units(given.unit_mm, given.unit_mn, given.dt_s),
-        given.force,
-        given.instruments,
+        Units(mechanics.unit_mm, mechanics.unit_mn, mechanics.dt_s),
+        mechanics.force,
+        mechanics.instruments,
         patch_mm=fem.footprint_mm[0],
         young_kpa=fem.young_kpa[0] if fem.young_kpa[0] == fem.young_kpa[1] else None,
         outward=None if pulls else job.anatomy.craniotomy.direction,

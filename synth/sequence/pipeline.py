@@ -28,7 +28,7 @@ from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 from synth.render.camera.video_link import transmit
 from synth.render.scene import Renderer
-from synth.sequence.published_labels import Published
+from synth.sequence.published_labels import PublishedLabels
 from synth.sequence.rest_scene import Scene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
@@ -61,7 +61,7 @@ class _Task:
 
     scene: Scene
     renderer: Renderer
-    wanted: frozenset[str]
+    field_names: frozenset[str]
     """Names of the fields that the job stores."""
     watch: Stopwatch
     report: StageCallback
@@ -88,10 +88,10 @@ def write_scene(
     _refuse_unseen(scene, renderer)
     width, height = job.render.size
     task = _Task(scene, renderer, frozenset(job.stored_fields), watch, report)
-    at_rest = _measure_rest(task)
+    rest_fields = _measure_rest(task)
     writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=scene.dataset)
     Folder(Path(folder)).refuse_replaced(scene.dataset, writer.job_identity)
-    for name, values, t in chain(starmap(_Values, at_rest.items()), _run(task)):
+    for name, values, t in chain(starmap(_Values, rest_fields.items()), _run(task)):
         with watch.stage("store"):
             if t is None:
                 writer.put(name, values)
@@ -128,12 +128,12 @@ def _refuse_unseen(scene: Scene, renderer: Renderer) -> None:
 def _measure_rest(task: _Task) -> dict[str, Array]:
     """Fields of the whole sequence that need no picture; labels are in camera axes."""
     scene, rest = task.scene, task.renderer.rest
-    each = scene.motion.by_instrument @ scene.view.rotation.T
-    none = max(MOST_INSTRUMENTS - each.shape[1], 0)
+    forces = scene.motion.by_instrument @ scene.view.rotation.T
+    missing = max(MOST_INSTRUMENTS - forces.shape[1], 0)
     fields = {
         "time": scene.time,
         "force": scene.force,
-        "force_of": np.pad(each, ((0, 0), (0, none), (0, 0))),
+        "force_of": np.pad(forces, ((0, 0), (0, missing), (0, 0))),
         "tissue": rest.tissue,
         "area": rest.area,
     }
@@ -149,12 +149,12 @@ def _render_frames(task: _Task, videos: list[_Video]) -> Iterator[_Values]:
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
         rng = np.random.default_rng(scene.draw.label_seed)
-        labels = Published(job.labels, tissue, job.frames, rng)
-    every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
-    later = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
-    names = [name for name in every if FIELDS[name].framed and name not in later]
+        labels = PublishedLabels(job.labels, tissue, job.frames, rng)
+    candidates = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
+    deferred = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
+    names = [name for name in candidates if FIELDS[name].framed and name not in deferred]
     shape = (job.frames, height, width)
-    cameras = _CAMERAS if "rgb_right" in task.wanted else _CAMERAS[:1]
+    cameras = _CAMERAS if "rgb_right" in task.field_names else _CAMERAS[:1]
     videos += [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in cameras]
     poses = np.empty((job.frames, 4, 4))
     for t in range(job.frames):
@@ -162,14 +162,14 @@ def _render_frames(task: _Task, videos: list[_Video]) -> Iterator[_Values]:
         with task.watch.stage("render"):
             frame = scene.frame(t)
         if t == 0:
-            free = tissue & ~frame.tool
-            if blank_share(frame.rgb[free] if free.any() else frame.rgb) > MOST_BLANK:
+            clear = tissue & ~frame.tool
+            if blank_share(frame.rgb[clear] if clear.any() else frame.rgb) > MOST_BLANK:
                 raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
         elif not frame.visible[tissue].any():
             raise UserError(f"frame {t}: none of the tissue is visible any more; widen render.field_mm")
-        made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
+        published = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
         for name in names:
-            yield _Values(name, made[name] if name in made else getattr(frame, name), t)
+            yield _Values(name, published[name] if name in published else getattr(frame, name), t)
         yield _Values("traction", frame.traction, t)
         for video, (rgb, tool) in zip(videos, cameras, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
@@ -186,11 +186,11 @@ def _recover_motion(task: _Task, videos: Sequence[_Video]) -> Iterator[_Values]:
     job, tissue = task.scene.job, task.renderer.rest.tissue
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
-        blocked = [with_highlights(*video) for video in videos]
-        recovered = track.track(create(job.flow.backend), videos[0].rgb, blocked[0], tissue)
-    yield _Values("flow_recovered", recovered.flow)
-    yield _Values("flow_confidence", recovered.confidence)
-    if "motion_recovered" not in task.wanted:
+        masks = [with_highlights(*video) for video in videos]
+        flow_track = track.track(create(job.flow.backend), videos[0].rgb, masks[0], tissue)
+    yield _Values("flow_recovered", flow_track.flow)
+    yield _Values("flow_confidence", flow_track.confidence)
+    if "motion_recovered" not in task.field_names:
         return
     with task.watch.stage("stereo"):
         left, right = task.renderer.camera, task.renderer.right
@@ -201,19 +201,19 @@ def _recover_motion(task: _Task, videos: Sequence[_Video]) -> Iterator[_Values]:
             *between(left, right),
             size=job.render.size,
         )
-        still = stereo.still_frames(recovered.flow, tissue)
-        rest = videos[0].rgb[:still], videos[1].rgb[:still]
-        tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], tissue)
+        still_count = stereo.still_frames(flow_track.flow, tissue)
+        rest = videos[0].rgb[:still_count], videos[1].rgb[:still_count]
+        tracker = stereo.StereoTracker(pair, *rest, masks[0][0], masks[1][0], tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
         with task.watch.stage("stereo"):
             if t == 0:
-                moved = stereo.Moved.nothing(tissue.shape)
+                stereo_motion = stereo.Motion3D.zeros(tissue.shape)
             else:
-                now = videos[0].rgb[t], videos[1].rgb[t], blocked[0][t], blocked[1][t]
-                moved = tracker.step(*now, recovered.flow[t], recovered.confidence[t])
-        yield _Values("motion_recovered", moved.motion, t)
-        yield _Values("motion_deviation", moved.deviation, t)
+                views = videos[0].rgb[t], videos[1].rgb[t], masks[0][t], masks[1][t]
+                stereo_motion = tracker.step(*views, flow_track.flow[t], flow_track.confidence[t])
+        yield _Values("motion_recovered", stereo_motion.motion, t)
+        yield _Values("motion_deviation", stereo_motion.deviation, t)
 
 
 def _describe(scene: Scene, renderer: Renderer) -> dict[str, Any]:
@@ -242,7 +242,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, Any]:
 def _mechanics(scene: Scene) -> dict[str, Any]:
     """The attribute `mechanics` of a sequence; what its mechanics did not compute is absent."""
     case, motion, fem = scene.scenario, scene.motion, scene.job.fem
-    forces, known = motion.by_instrument, "force" in scene.job.stored_fields
+    forces, has_force = motion.by_instrument, "force" in scene.job.stored_fields
     timeless = fem.time == "quasi-static" and not fem.relaxation
     law_from = LAWS.source(case.tissue.law)
     series = {"min_jacobian": motion.min_jacobian, "energy_mn_mm": motion.energy, "residual": motion.residual}
@@ -263,7 +263,7 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
             {
                 "kind": kind,
                 "instrument": instrument,
-                **({"force_mn": (forces[:, k] @ scene.view.rotation.T).tolist()} if known else {}),
+                **({"force_mn": (forces[:, k] @ scene.view.rotation.T).tolist()} if has_force else {}),
                 "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
                 "shaft": motion.shaft[:, 2 * k].tolist(),
             }

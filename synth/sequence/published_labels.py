@@ -33,34 +33,34 @@ def intensity(traction: NDArray[np.floating], force_mn: float) -> Floats:
 def add_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generator) -> Floats:
     """First stage: normal noise, a `share` of each label (H, W, 3) mN, on those of the tissue (H, W)."""
     out = np.zeros_like(label)
-    mine = label[tissue]
-    rng.random((len(mine), 1))  # the published code draws outliers too, of which its example has none
-    out[tissue] = mine + share * lengths(mine)[:, None] * rng.normal(size=mine.shape)
+    values = label[tissue]
+    rng.random((len(values), 1))  # the published code draws outliers too, of which its example has none
+    out[tissue] = values + share * lengths(values)[:, None] * rng.normal(size=values.shape)
     return out
 
 
 def disturb(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Floats]:
     """Second stage, in one frame: flow (H, W, 2) px and label (H, W) mN with some points disturbed."""
     flow, label = flow.copy(), label.copy()
-    place = np.argwhere(tissue)
+    positions = np.argwhere(tissue)
     force = label[tissue]
     free = force <= np.percentile(force, _LOW) if len(force) else np.zeros(0, bool)
-    pressed = place[force > np.percentile(force, 90)] if force.max(initial=0) > 0 else place[:0]
-    if len(pressed):
-        centre = pressed.mean(axis=0)
-        reach = _NEAR * np.linalg.norm(pressed - centre, axis=1).max()
-        reach = max(reach, _LEAST_REACH * float(np.linalg.norm(np.ptp(place, axis=0))))
-        free &= np.linalg.norm(place - centre, axis=1) > reach
+    contact = positions[force > np.percentile(force, 90)] if force.max(initial=0) > 0 else positions[:0]
+    if len(contact):
+        centre = contact.mean(axis=0)
+        reach = _NEAR * np.linalg.norm(contact - centre, axis=1).max()
+        reach = max(reach, _LEAST_REACH * float(np.linalg.norm(np.ptp(positions, axis=0))))
+        free &= np.linalg.norm(positions - centre, axis=1) > reach
     candidates = np.flatnonzero(free)
-    count = min(int(len(place) * _POINTS), len(candidates))
-    rows, columns = place[rng.choice(candidates, count, replace=False)].T if count else place[:0].T
-    span = _RANGE * np.ptp(flow[tissue], axis=0) if len(place) else np.zeros(2)
+    count = min(int(len(positions) * _POINTS), len(candidates))
+    rows, columns = positions[rng.choice(candidates, count, replace=False)].T if count else positions[:0].T
+    span = _RANGE * np.ptp(flow[tissue], axis=0) if len(positions) else np.zeros(2)
     flow[rows, columns] += (rng.uniform(-1, 1, (count, 2)) * span).astype(np.float32)
     label[rows, columns] = 0.0
     return flow, label
 
 
-class Published:
+class PublishedLabels:
     """Both stages for one sequence; frames must be processed in order."""
 
     def __init__(self, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> None:

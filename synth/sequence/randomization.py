@@ -18,7 +18,7 @@ from synth.job.types import Group, Scenery
 from synth.render.appearance.family import Appearance, Colour
 from synth.render.appearance.light import FreeLamp, Lighting, blackbody
 from synth.render.camera.camera import CameraView, Lens
-from synth.render.camera.colour_processing import KNOTS, encoded
+from synth.render.camera.colour_processing import KNOTS, encode_srgb
 from synth.render.randomized.pattern import Pattern
 from synth.render.randomized.surroundings import Randomization, Surroundings
 
@@ -113,9 +113,9 @@ class _Draws:
 
     def colour(self) -> Colour:
         """A colour from grey to saturated, from dark to white, linear RGB."""
-        bright, saturation = np.exp(self.rng.uniform(np.log(0.1), np.log(0.85))), self.rng.uniform(0, 0.9)
+        brightness, saturation = np.exp(self.rng.uniform(np.log(0.1), np.log(0.85))), self.rng.uniform(0, 0.9)
         hue = self.rng.uniform(0, 1, 3) ** 2
-        return _rgb(np.clip(bright * (1 - saturation + saturation * hue / hue.max()), 0.02, 0.9))
+        return _rgb(np.clip(brightness * (1 - saturation + saturation * hue / hue.max()), 0.02, 0.9))
 
     def colours(self, contrast: float) -> Colours:
         """Three colours of any hue and brightness, at a contrast from 0 (equal) to 1."""
@@ -188,8 +188,8 @@ def vary(
         sensor = replace(sensor, native=native, halo_px=draw("halo_px"), white=white)
     if job.randomize.get("light"):
         lighting = _draw_light(lighting, job, index)
-    varied = replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
-    return varied, replace(appearance, sensor=sensor, light=lighting)
+    varied_view = replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
+    return varied_view, replace(appearance, sensor=sensor, light=lighting)
 
 
 def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
@@ -200,11 +200,11 @@ def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
     draw, (across, down) = _Draws(job, index, "field"), job.render.size
     width, tilt = draw("field_mm"), draw("tilt_deg")
     layout = str(draw.rng.choice(["hole", "edges", "corner"])) if draw.happens(0.85) else "usual"
-    hole, large, away = (float(draw.rng.uniform(*ends)) for ends in ((0.2, 0.42), (0.3, 0.6), (0.28, 0.36)))
+    hole, large, offset = (float(draw.rng.uniform(*ends)) for ends in ((0.2, 0.42), (0.3, 0.6), (0.28, 0.36)))
     # From edge to edge the corners are tissue, whatever tilt and perspective.
     edges = 0.75 * float(np.hypot(1, down / across) / np.cos(np.radians(tilt)))
     share = {"usual": 12 / 35, "hole": hole, "edges": edges, "corner": large}[layout]
-    x, y = away * draw.rng.choice([-1.0, 1.0], 2) if layout == "corner" else (0.0, 0.0)
+    x, y = offset * draw.rng.choice([-1.0, 1.0], 2) if layout == "corner" else (0.0, 0.0)
     radius = share * width
     scale, largest = float(radius / draw.rng.uniform(*_PATCH_MM)), min(0.17 * width, 0.42 * radius)
     keys: Keys = {
@@ -229,10 +229,10 @@ def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
 
 def _draw_support(draw: _Draws, radius: float) -> AttachmentSection:
     """A ball or a sheet that holds the tissue below an opening of a radius, off its contacts."""
-    turn, aside, deep = draw.rng.uniform((0, 0, 0.9), (2 * np.pi, 0.7, 1.6)).tolist()
-    way = float(np.cos(turn)), float(np.sin(turn))
-    point = (radius * aside * way[0], radius * aside * way[1], -radius * deep)
-    normal = (*way, 0.0) if draw.rng.random() < 0.5 else None
+    turn, aside, depth = draw.rng.uniform((0, 0, 0.9), (2 * np.pi, 0.7, 1.6)).tolist()
+    heading = float(np.cos(turn)), float(np.sin(turn))
+    point = (radius * aside * heading[0], radius * aside * heading[1], -radius * depth)
+    normal = (*heading, 0.0) if draw.rng.random() < 0.5 else None
     return AttachmentSection(point=point, radius_mm=radius / 2, normal=normal, thickness_mm=radius / 4)
 
 
@@ -257,32 +257,32 @@ def _draw_sheet(job: Job, index: int) -> Surroundings | None:
     return Surroundings(kind, pattern, corners, longer, lip, rise * bool(folds), folded, refraction)
 
 
-def _draw_light(usual: Lighting, job: Job, index: int) -> Lighting:
+def _draw_light(lighting: Lighting, job: Job, index: int) -> Lighting:
     """One to six lamps, in a ring around the lens or anywhere down to grazing."""
     draw = _Draws(job, index, "light")
-    ring, some = draw.happens(0.25), draw.happens(1.0)
-    count = 6 if ring else int(draw.rng.integers(1, 7)) if some else 2
+    ring, random_count = draw.happens(0.25), draw.happens(1.0)
+    count = 6 if ring else int(draw.rng.integers(1, 7)) if random_count else 2
     shares = draw.rng.uniform(0.15, 1, count) ** (not ring)
-    near, first = draw("ring_tilt_deg"), float(draw.rng.uniform(0, 360))
+    ring_tilt_deg, first_turn_deg = draw("ring_tilt_deg"), float(draw.rng.uniform(0, 360))
     lamps = []
     for k, share in enumerate((shares / shares.sum()).tolist()):
         lean, turn = draw("lamp_tilt_deg"), float(draw.rng.uniform(0, 360))
-        lean, turn = (near, first + 60 * k) if ring else (lean, turn)
+        lean, turn = (ring_tilt_deg, first_turn_deg + 60 * k) if ring else (lean, turn)
         colour = blackbody(draw("kelvin"))
         if draw.happens(0.25):
             colour = colour * draw.rng.uniform(0.3, 1.3, 3)
         lamps.append(FreeLamp(lean, turn, share, _rgb(colour), draw("window_deg")))
     even, ambient = draw("even"), draw("ambient")
-    return replace(usual, lamps=tuple(lamps), even=even, ambient=ambient, drift=draw("drift"))
+    return replace(lighting, lamps=tuple(lamps), even=even, ambient=ambient, drift=draw("drift"))
 
 
 def _draw_sensor(job: Job, index: int) -> tuple[float, dict[str, Any]]:
     """Radius of the aperture [mm], and keys of sensor, video processor and codec."""
     draw, (width, height) = _Draws(job, index, "camera"), job.render.size
     rng, s = draw.rng, draw.strength
-    mixed = np.eye(3) + s * rng.uniform(-0.25, 0.25, (3, 3))
+    matrix = np.eye(3) + s * rng.uniform(-0.25, 0.25, (3, 3))
     gamma, gain = np.exp(s * rng.uniform((-0.4, -0.1), (0.3, 0.25)))
-    level = encoded(np.array(KNOTS)) ** gamma
+    level = encode_srgb(np.array(KNOTS)) ** gamma
     level = gain * (level + s * rng.uniform(-0.3, 0.3) * level * (1 - level) * (2 * level - 1))
     curves = np.clip(level * (1 + s * rng.uniform(-0.06, 0.06, (3, 1))), 0, 1)
     bits = float(np.exp(rng.uniform(np.log(0.05), 0)))  # a pixel
@@ -292,7 +292,7 @@ def _draw_sensor(job: Job, index: int) -> tuple[float, dict[str, Any]]:
         "read_noise": (draw("read_noise"),) * 2,
         "vignette": draw("vignette"),
         "blur_px": (draw.between((0.4, 1.2), (0, 2.5 * BLUR_WIDTH_PX / width)),) * 2,
-        "matrix": _rows(mixed / mixed.sum(axis=1, keepdims=True)),
+        "matrix": _rows(matrix / matrix.sum(axis=1, keepdims=True)),
         "curves": _rows(np.maximum.accumulate(curves, axis=1)),
         "sharpening": (draw("sharpening") * float(rng.uniform(1 - s, 1)),) * 2,
         "chroma": str(rng.choice(["4:4:4", "4:2:2", "4:2:0"])) if draw.happens(1) else "4:4:4",

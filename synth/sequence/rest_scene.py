@@ -124,15 +124,18 @@ class RestScene:
     def renderer(self) -> Renderer:
         """Renderer of this scene for any state of its surface and instruments."""
         sensor, job, content = self.scenario.appearance.sensor, self.job, self.content(self)
-        drawn, own = content.tissue.shape, self.shape
-        if not (np.array_equal(drawn.faces, own.faces) and np.array_equal(drawn.vertices, own.vertices)):
+        content_shape, surface_shape = content.tissue.shape, self.shape
+        if not (
+            np.array_equal(content_shape.faces, surface_shape.faces)
+            and np.array_equal(content_shape.vertices, surface_shape.vertices)
+        ):
             raise UserError("content: its tissue must have the vertices and faces of the scene's surface")
-        look = job.render
+        section = job.render
         lens = self.draw.camera, sensor, job.store.extra, self.draw.right
-        made = Renderer(content, *lens, spp=look.spp, variant=look.variant)
-        if not made.rest.tissue.any():
+        renderer = Renderer(content, *lens, spp=section.spp, variant=section.variant)
+        if not renderer.rest.tissue.any():
             raise UserError("render: the camera shows no tissue; change render.tilt_deg or the opening")
-        return made
+        return renderer
 
     @property
     def tissue(self) -> Mask:
@@ -160,8 +163,8 @@ class Scene(RestScene):
     @cached_property
     def _timeline(self) -> Timeline:
         case, rest = self.scenario, self.surface.vertices
-        moving = case.camera_motion, case.appearance.light, self.job.fps
-        return Timeline(rest, self.motion, self.view, *moving, case.idle)
+        settings = case.camera_motion, case.appearance.light, self.job.fps
+        return Timeline(rest, self.motion, self.view, *settings, case.idle)
 
     def __len__(self) -> int:
         return self.job.frames
@@ -196,17 +199,17 @@ class Scene(RestScene):
         """
         if not 0 <= t < len(self):
             raise UserError(f"frame {t}: the scene has frames 0 to {len(self) - 1}")
-        job, line = self.job, self._timeline
-        now = line.at(t)
-        lit = line.exposure(t, job.sensor.shutter)
-        rendered = self.renderer.render(now, self.draw.frame_seeds[t], lit, line.at(t + 1))
+        job, timeline = self.job, self._timeline
+        state = timeline.at(t)
+        exposures = timeline.exposure(t, job.sensor.shutter)
+        rendered = self.renderer.render(state, self.draw.frame_seeds[t], exposures, timeline.at(t + 1))
         return Frame(
             **vars(rendered),
             index=t,
             time_s=float(self.time[t]),
             traction=self.renderer.traction(self.motion.traction[t]),
             force=self.force[t],
-            camera=now.camera or self.view,
+            camera=state.camera or self.view,
         )
 
     def frames(self) -> Iterator[Frame]:
@@ -229,12 +232,12 @@ class Scene(RestScene):
         """
         if not frames or frames[0].index != 0:
             raise UserError("recover_flow: the frames must begin with the rest frame, number 0")
-        chosen = self.job.flow.backend if backend is None else backend
-        if chosen == "ideal":
+        estimator = self.job.flow.backend if backend is None else backend
+        if estimator == "ideal":
             raise UserError("flow.backend: `ideal` recovers no flow; name an estimator")
         rgb, tools = np.stack([frame.rgb for frame in frames]), np.stack([frame.tool for frame in frames])
         rgb = transmit(rgb, self.job.fps, self.job.sensor.bitrate_mbps, self.job.sensor.chroma)
-        return track.recover_flow(rgb, tools, self.tissue, chosen)
+        return track.recover_flow(rgb, tools, self.tissue, estimator)
 
 
 def draw_craniotomy(rest: RestScene) -> SceneContent:
@@ -272,30 +275,30 @@ def at_rest(
     return build(draw(job, index, case=case), content)
 
 
-def build(drawn: Draw, content: Callable[[RestScene], SceneContent] | None = None) -> RestScene:
+def build(sequence_draw: Draw, content: Callable[[RestScene], SceneContent] | None = None) -> RestScene:
     """The surface of a sequence, grown or read, and what is drawn around it. Raises as `at_rest`."""
-    anatomy, series = drawn.job.anatomy, None
-    if drawn.job.mechanics.source is not None:
-        series = read_job_series(drawn.job, drawn.index)
-    mesh, relief, scale = anatomy.mesh, drawn.scenario.relief, drawn.scale
-    about = mesh.stat() if mesh and mesh.is_file() else None
-    given = _Given(
+    anatomy, series = sequence_draw.job.anatomy, None
+    if sequence_draw.job.mechanics.source is not None:
+        series = read_job_series(sequence_draw.job, sequence_draw.index)
+    mesh, relief, scale = anatomy.mesh, sequence_draw.scenario.relief, sequence_draw.scale
+    stat = mesh.stat() if mesh and mesh.is_file() else None
+    source = _SurfaceSource(
         mesh,
         anatomy.fill_holes,
-        None if mesh is None and series is None else drawn.craniotomy,
-        drawn.attachments if mesh is not None else (),
+        None if mesh is None and series is None else sequence_draw.craniotomy,
+        sequence_draw.attachments if mesh is not None else (),
         series,
-        about and (about.st_mtime_ns, about.st_size),
+        stat and (stat.st_mtime_ns, stat.st_size),
     )
     # A procedural surface is grown in its usual size; whoever draws another organ has no veins on it.
-    usual = replace(relief, gyrus_mm=relief.gyrus_mm / scale, sulcus_mm=relief.sulcus_mm / scale)
-    sizes = drawn.opening_mm / scale, anatomy.vertices, anatomy.dome_mm / scale
-    surface, brain = _build_cortex(given, usual, *sizes, series is None or content is None)
-    return RestScene(drawn, resize(surface, scale), brain, content or draw_craniotomy, series)
+    base_relief = replace(relief, gyrus_mm=relief.gyrus_mm / scale, sulcus_mm=relief.sulcus_mm / scale)
+    sizes = sequence_draw.opening_mm / scale, anatomy.vertices, anatomy.dome_mm / scale
+    surface, brain = _build_cortex(source, base_relief, *sizes, series is None or content is None)
+    return RestScene(sequence_draw, resize(surface, scale), brain, content or draw_craniotomy, series)
 
 
 @dataclass(frozen=True)
-class _Given:
+class _SurfaceSource:
     """The user's surface, if any."""
 
     mesh: Path | None
@@ -317,10 +320,10 @@ class _Given:
 
 @lru_cache(maxsize=4)
 def _build_cortex(
-    given: _Given, relief: Relief, opening_mm: float, vertices: int, dome_mm: float, veined: bool
+    source: _SurfaceSource, relief: Relief, opening_mm: float, vertices: int, dome_mm: float, veined: bool
 ) -> tuple[CortexSurface, Brain | None]:
     """The fine surface, and the user's brain that it is part of, if any; cached, hence read-only."""
-    brain = given.place()
+    brain = source.place()
     shape = None if brain is None else brain.shape
     surface = grow(relief, opening_mm, vertices=vertices, dome_mm=dome_mm, brain=shape, veined=veined)
     for value in (*vars(surface).values(), *((*brain.shape, brain.to_world) if brain else ())):

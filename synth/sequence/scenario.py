@@ -114,21 +114,21 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
     law, why = fem.chosen_law
     young = _log_uniform(rng, fem.young_kpa)
     # Drawn even where unused, so that other numbers do not depend on whether there is a membrane.
-    drawn, membrane = rng.uniform(), fem.membrane
+    chance, membrane = rng.uniform(), fem.membrane
     stiff, thick = _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm)
     stretch = _uniform(rng, _STRETCH)
     poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
     alpha = _uniform(rng, fem.alpha)
     pia = Pia(stiff, thick, stretch, _uniform(rng, membrane.stiffening))  # the last one drawn
-    return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull, alpha)
+    return Tissue(young, poisson, law, why, pia if chance < membrane.probability else None, skull, alpha)
 
 
 def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
     """Draws amplitudes, rates and phases uniformly; None without motion."""
     turn = 0, 2 * np.pi
     heart, breath = (pulse.heart_mm, HEART_HZ, turn), (pulse.breath_mm, BREATH_HZ, turn)
-    drawn = Pulse(*(_uniform(rng, ends) for ends in (*heart, *breath)))
-    return drawn if drawn.heart_mm or drawn.breath_mm else None
+    drawn_pulse = Pulse(*(_uniform(rng, ends) for ends in (*heart, *breath)))
+    return drawn_pulse if drawn_pulse.heart_mm or drawn_pulse.breath_mm else None
 
 
 def draw_gestures(
@@ -149,27 +149,32 @@ def draw_gestures(
 
     Raises UserError if not all instruments fit into the opening, or not in their places.
     """
-    given, (fewest, most), meshes = fem.instrument_list, fem.instruments, read_job_instruments(fem)
-    drawn = max(int(others.integers(fewest, most + 1)), len(given))
-    sight, least = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
+    named_sections, (fewest, most), meshes = fem.instrument_list, fem.instruments, read_job_instruments(fem)
+    target_count = max(int(others.integers(fewest, most + 1)), len(named_sections))
+    sight, least_cosine = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
     # Each time all anew: the shaft of one may be in the way of the next. At last fewer, if the job allows it.
-    for count in (*[drawn] * _ROUNDS, *range(drawn - 1, max(fewest, len(given)) - 1, -1)):
-        wanted = [*given, *[InstrumentSection()] * (count - len(given))]
+    for count in (
+        *[target_count] * _ROUNDS,
+        *range(target_count - 1, max(fewest, len(named_sections)) - 1, -1),
+    ):
+        sections = [*named_sections, *[InstrumentSection()] * (count - len(named_sections))]
         order, placed_gestures = (
-            sorted(range(count), key=lambda k: wanted[k].place is None),
+            sorted(range(count), key=lambda k: sections[k].place is None),
             dict[int, Gesture](),
         )
         for k in order:
             for _ in range(_TRIES):
                 generator = others if k else rng
                 if fem.contact == ("driven",):
-                    trial = draw_driven_gesture(fem, opening_mm, generator, wanted[k], visible_mm, frames)
+                    trial = draw_driven_gesture(fem, opening_mm, generator, sections[k], visible_mm, frames)
                 else:
-                    trial = draw_gesture(fem, opening_mm, young_kpa, generator, wanted[k], visible_mm, frames)
+                    trial = draw_gesture(
+                        fem, opening_mm, young_kpa, generator, sections[k], visible_mm, frames
+                    )
                 longest = np.linalg.norm(trial.axes, axis=1).max()
-                clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
-                fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
-                hides = trial.shaft @ sight > least and trial.instrument != "none"
+                limit_mm = max(opening_mm - CLEAR_MM, longest) if named_sections else opening_mm
+                fits = trial.reach_mm <= min(limit_mm, opening_mm) + 1e-9
+                hides = trial.shaft @ sight > least_cosine and trial.instrument != "none"
                 apart = (_are_apart(trial, other, meshes) for other in placed_gestures.values())
                 if fits and not hides and all(apart):
                     placed_gestures[k] = trial
@@ -178,10 +183,10 @@ def draw_gestures(
                 break
         else:
             return tuple(placed_gestures[k] for k in range(count))
-    placed = f" next to {len(placed_gestures)} others" if placed_gestures else ""
-    key = "instrument_list" if given else "instruments"
+    neighbours = f" next to {len(placed_gestures)} others" if placed_gestures else ""
+    key = "instrument_list" if named_sections else "instruments"
     raise UserError(
-        f"fem.{key}: instrument {k + 1} of {count} does not fit{placed} "
+        f"fem.{key}: instrument {k + 1} of {count} does not fit{neighbours} "
         f"into an opening of {opening_mm:g} mm radius; lower fem.instruments or footprint_mm, change "
         "its place or direction, or widen anatomy.craniotomy.radius_mm or render.field_mm"
     )
@@ -192,53 +197,53 @@ def draw_gesture(
     opening_mm: float,
     young_kpa: float,
     rng: Random,
-    given: InstrumentSection = InstrumentSection(),
+    section: InstrumentSection = InstrumentSection(),
     visible_mm: float = np.inf,
     frames: int = _FRAMES,
 ) -> Gesture:
-    """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone, unless `given`.
+    """Draws one gesture: contact uniformly in the opening, direction in its cone, unless `section` gives it.
 
     Its contacts stay within the opening and within `visible_mm` of its middle, which the camera shows of a
     wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
-    drawn, wanted, further = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
-    choices = fem.choices(given)
-    kind = drawn if drawn in choices else list(choices)[int(further.integers(len(choices)))]
+    preferred, ranges, extra_rng = str(rng.choice(fem.gestures)), fem.load_range(section), rng.spawn(1)[0]
+    choices = fem.choices(section)
+    kind = preferred if preferred in choices else list(choices)[int(extra_rng.integers(len(choices)))]
     tools = choices[kind]
-    tool = name_of(list(tools)[int(further.choice(len(tools), p=list(tools.values())))])
-    footprint = _uniform(rng, wanted.footprint_mm)
+    tool = name_of(list(tools)[int(extra_rng.choice(len(tools), p=list(tools.values())))])
+    footprint = _uniform(rng, ranges.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
-    load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
+    load = _uniform(rng, ranges.load) if ranges.force_mn is None else _uniform(rng, ranges.force_mn) / unit_mn
     spread = footprint * _uniform(rng, (1.2, 1.8) if kind == "grasp" else (0.1, 0.4))
     path = _uniform(rng, (3, 8)) if kind == "slide" else 0.0
     azimuth = _uniform(rng, (0, 360))
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
-    long = tool_gesture.form(kind, tool)
-    reach = footprint * np.sqrt(max(long, 1 / long)) + 0.5 * half
+    elongation = tool_gesture.aspect_ratio(kind, tool)
+    reach = footprint * np.sqrt(max(elongation, 1 / elongation)) + 0.5 * half
     # The middle of the contacts; a circle of `reach` around it lies in opening and picture.
     largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
     radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
     point = radius * np.array([np.cos(angle), np.sin(angle)])
-    if given.place is not None:
-        point = np.asarray(given.place, np.float64)
-    along, direction = _draw_direction(fem, kind, rng, given)
+    if section.place is not None:
+        point = np.asarray(section.place, np.float64)
+    along, direction = _draw_direction(fem, kind, rng, section)
     if kind == "retract":  # the hand is on the side that tissue is drawn to, in a quarter of them opposite
-        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (further.random() < 0.25)
-        azimuth = float((turn + _uniform(further, (-30, 30))) % 360)
+        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (extra_rng.random() < 0.25)
+        azimuth = float((turn + _uniform(extra_rng, (-30, 30))) % 360)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
-    whole = load * unit_mn * directions.sum(axis=0)
-    each = zip(places.tolist(), load * unit_mn * directions, strict=True)
+    total_force = load * unit_mn * directions.sum(axis=0)
+    contact_forces = zip(places.tolist(), load * unit_mn * directions, strict=True)
     drawn_timing = _draw_timing(kind, rng, frames)
-    touch, full, fall, release = map(float, given.timing or drawn_timing)
+    touch, full, fall, release = map(float, section.timing or drawn_timing)
     return Gesture(
         kind=kind,
         instrument=tool,
-        contacts=tuple(ToolContact((x, y), _vector(part)) for (x, y), part in each),
+        contacts=tuple(ToolContact((x, y), _vector(part)) for (x, y), part in contact_forces),
         footprint_mm=footprint,
         load=load,
         point_mm=(float(point[0]), float(point[1])),
-        direction=_vector(whole / np.linalg.norm(whole)),
-        force_mn=float(np.linalg.norm(whole)),
+        direction=_vector(total_force / np.linalg.norm(total_force)),
+        force_mn=float(np.linalg.norm(total_force)),
         path_mm=(float(path * along[0]), float(path * along[1])),
         azimuth_deg=azimuth,
         elevation_deg=_uniform(rng, (35, 65)),
@@ -253,7 +258,7 @@ def draw_driven_gesture(
     fem: FemSection,
     opening_mm: float,
     rng: Random,
-    given: InstrumentSection = InstrumentSection(),
+    section: InstrumentSection = InstrumentSection(),
     visible_mm: float = np.inf,
     frames: int = _FRAMES,
 ) -> Gesture:
@@ -261,13 +266,13 @@ def draw_driven_gesture(
 
     Sizes are drawn from those of instruments; the way is at most that over which a contact of its size holds.
     """
-    choices = fem.choices(given)
+    choices = fem.choices(section)
     kinds = [kind for kind in fem.gestures if kind in choices] or list(choices)
     kind = kinds[int(rng.integers(len(kinds)))]
     tools = choices[kind]
-    chosen = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
-    tool, sized = name_of(chosen), chosen if isinstance(chosen, str) else "none"
-    length, width = _draw_size(kind, sized, rng, given)
+    chosen_tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
+    tool, size_name = name_of(chosen_tool), chosen_tool if isinstance(chosen_tool, str) else "none"
+    length, width = _draw_size(kind, size_name, rng, section)
     mean = float(np.sqrt(length * width))  # of the fold that a grasp holds
     spread, closing, reach = 0.1 * width, 0.0, 0.5 * float(np.hypot(length, width))
     if kind == "grasp":  # each tip holds a half of it
@@ -276,15 +281,15 @@ def draw_driven_gesture(
     largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
     radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
     point = radius * np.array([np.cos(angle), np.sin(angle)])
-    if given.place is not None:
-        point = np.asarray(given.place, np.float64)
-    along, direction = _draw_direction(fem, kind, rng, given)
+    if section.place is not None:
+        point = np.asarray(section.place, np.float64)
+    along, direction = _draw_direction(fem, kind, rng, section)
     azimuth = _uniform(rng, (0, 360))
     if kind == "retract":  # the hand is on the side that tissue is drawn to
         azimuth = float((np.degrees(np.arctan2(along[1], along[0])) + _uniform(rng, (-30, 30))) % 360)
-    travel, force = _draw_way(fem, _HOLDS[kind] * mean, rng, given)
+    travel, force = _draw_travel(fem, _HOLDS[kind] * mean, rng, section)
     places, _ = tool_gesture.grip(kind, point, direction, spread, azimuth)
-    touch, full, fall, release = map(float, given.timing or _draw_timing(kind, rng, frames))
+    touch, full, fall, release = map(float, section.timing or _draw_timing(kind, rng, frames))
     return Gesture(
         kind=kind,
         instrument=tool,
@@ -301,47 +306,49 @@ def draw_driven_gesture(
         hover_mm=_uniform(rng, (6, 12)),
         taps=min(int(rng.integers(2, 4)), max((frames - 1) // 3, 1)) if kind == "tap" else 1,
         timing=(touch, full, fall, release),
-        drive=Drive(travel, force, closing, (length, width), yields=given.travel_mm is None),
+        drive=Drive(travel, force, closing, (length, width), yields=section.travel_mm is None),
     )
 
 
-def _draw_size(kind: str, sized: Instrument, rng: Random, given: InstrumentSection) -> tuple[float, float]:
-    """Length and width [mm] of what an instrument holds; `sized`: its name among `DRIVEN_SIZES_MM`."""
-    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[sized])
-    if sized in _ROUND:
+def _draw_size(
+    kind: str, size_name: Instrument, rng: Random, section: InstrumentSection
+) -> tuple[float, float]:
+    """Length and width [mm] of what an instrument holds; `size_name`: its name among `DRIVEN_SIZES_MM`."""
+    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[size_name])
+    if size_name in _ROUND:
         width = length
     elif kind in ("push", "tap"):
         length = min(length, _TIP_LENGTH * width)  # it presses with its end
-    if given.footprint_mm is not None:
-        scale = 2 * _uniform(rng, given.footprint_mm) / np.sqrt(length * width)
+    if section.footprint_mm is not None:
+        scale = 2 * _uniform(rng, section.footprint_mm) / np.sqrt(length * width)
         length, width = scale * length, scale * width
     return length, width
 
 
-def _draw_way(
-    fem: FemSection, holds_mm: float, rng: Random, given: InstrumentSection
+def _draw_travel(
+    fem: FemSection, holds_mm: float, rng: Random, section: InstrumentSection
 ) -> tuple[float | None, float | None]:
     """Travel [mm], at most `holds_mm` unless it is given, or instead of it the force [mN] to be reached."""
-    way = rng.uniform()
-    ranges = given if given.travel_mm or given.force_mn else fem
+    quantile = rng.uniform()
+    ranges = section if section.travel_mm or section.force_mn else fem
     if ranges.force_mn is not None:
         low, high = ranges.force_mn
-        return None, float(low * (high / low) ** way)
+        return None, float(low * (high / low) ** quantile)
     low, high = ranges.travel_mm or (0.0, 0.0)
-    if given.travel_mm is None:  # one that is named is as given
+    if section.travel_mm is None:  # one that is named is as given
         low, high = min(low, holds_mm), min(high, holds_mm)
     log = fem.travel_scale == "log"
-    return float(low * (high / low) ** way if log else low + way * (high - low)), None
+    return float(low * (high / low) ** quantile if log else low + quantile * (high - low)), None
 
 
 def _are_apart(gesture: Gesture, other: Gesture, meshes: Mapping[str, OwnMesh]) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
     if tool_gesture.clearance(gesture, other) < 0:
         return False
-    (here, wide), (there, broad) = (
+    (rings, radii), (other_rings, other_radii) = (
         _rings(acting, meshes.get(acting.instrument)) for acting in (gesture, other)
     )
-    gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
+    gap = np.linalg.norm(rings[:, None] - other_rings[None], axis=2) - radii[:, None] - other_radii[None]
     return float(gap.min(initial=np.inf)) >= _APART_MM
 
 
@@ -353,9 +360,9 @@ def _rings(gesture: Gesture, mesh: OwnMesh | None = None) -> tuple[Floats, Float
     else:
         parts = (mesh.outline,)
     shapes = [np.zeros((0, 3))]
-    for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
-        place = gesture.point_mm + slid * np.asarray(gesture.path_mm)
-        tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + away * gesture.shaft
+    for slide, hover in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
+        place = gesture.point_mm + slide * np.asarray(gesture.path_mm)
+        tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + hover * gesture.shaft
         shapes += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
     rings = np.concatenate(shapes).reshape(-1, RING, 3)[::_RINGS]
     middles = rings.mean(axis=1)
@@ -363,7 +370,7 @@ def _rings(gesture: Gesture, mesh: OwnMesh | None = None) -> tuple[Floats, Float
 
 
 def _draw_direction(
-    fem: FemSection, kind: str, rng: Random, given: InstrumentSection
+    fem: FemSection, kind: str, rng: Random, section: InstrumentSection
 ) -> tuple[Floats, Floats]:
     """Unit vectors: of the load along the surface (2,), the direction of a slide, and of the load (3,)."""
     turn = rng.uniform(0, 2 * np.pi)
@@ -374,10 +381,10 @@ def _draw_direction(
         rise = rng.uniform(0.1, max(cone, 0.3))
     elif kind == "slide":
         rise = 1 / np.hypot(1, tool_gesture.FRICTION)
-    if given.direction is not None:
-        whole = np.asarray(given.direction) / np.linalg.norm(given.direction)
-        along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
-        rise = rise if kind == "slide" else abs(float(whole[2]))
+    if section.direction is not None:
+        unit = np.asarray(section.direction) / np.linalg.norm(section.direction)
+        along = unit[:2] / (np.hypot(*unit[:2]) or 1.0)
+        rise = rise if kind == "slide" else abs(float(unit[2]))
     up = rise if kind in ("pull", "grasp") else -rise
     return along, np.append(np.sqrt(1 - rise**2) * along, up)
 
@@ -424,19 +431,19 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     ranges = vars(FAMILIES[family])
     if job.appearance.blood:
         ranges = ranges | {"blood": job.appearance.blood}
-    drawn: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: _vary_colour(ends, rng) if len(ends) == 3 else _uniform(rng, ends)
         for name, ends in ranges.items()
     }
     # More glare: a thicker and rougher layer of a higher index, over more relief. Chosen on photographs.
     square = lighting.glare**2
-    drawn["fluid_smoothing_mm"] += 0.14 * square
-    drawn["bump"] *= 1 + 3 * square
-    drawn["roughness"] += 0.12 * square
-    drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
+    values["fluid_smoothing_mm"] += 0.14 * square
+    values["bump"] *= 1 + 3 * square
+    values["roughness"] += 0.12 * square
+    values["dry_roughness"] *= 1 - 0.6 * lighting.glare
     appearance = Appearance(
         family=family,
-        **drawn,
+        **values,
         fluid_index=1.33 + 0.47 * square,
         scenery=(),
         rim_seed=int(rng.integers(2**31)),
@@ -448,7 +455,7 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     sensor = replace(appearance.sensor, blur=blur * job.render.size[0] / BLUR_WIDTH_PX)
     parts = job.render.scenery
     chance = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts))
-    scenery = tuple(part for part, drawn in zip(parts, chance, strict=True) if drawn < _SHOWN[part])
+    scenery = tuple(part for part, level in zip(parts, chance, strict=True) if level < _SHOWN[part])
     return replace(appearance, sensor=sensor, scenery=scenery)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import Caution, UserError
 from synth.fem.deformation import Deformation
 from synth.fem.external.transfer import attach
@@ -34,54 +35,67 @@ class SeriesMechanics:
         turn, shift = rest.brain.to_world[:3, :3], rest.brain.to_world[:3, 3]
         with watch.stage("mesh"):
             transfer = attach(series.points @ turn.T + shift, series.faces, rest.shape)
-        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], rest.draw.opening_mm
-        moved = np.zeros((len(time), len(area), 3))
-        load, lost = np.zeros_like(moved), np.zeros((len(time), 3))
-        parts, work = np.zeros((len(time), count, 3)), np.zeros(len(time))
+        area, count = rest.vertex_area, series.tip.shape[1]
+        displacement = np.zeros((len(time), len(area), 3))
+        load, lost_force = np.zeros_like(displacement), np.zeros((len(time), 3))
+        instrument_forces, work = np.zeros((len(time), count, 3)), np.zeros(len(time))
         tip, shaft = (np.zeros((len(time), 2 * count, 3)) for _ in range(2))
-        for t, now in enumerate(time.tolist()):
+        for t, time_s in enumerate(time.tolist()):
             report("fem", t, len(time))
             with watch.stage("fem"):
-                moved[t] = transfer.move(series.at(now, "displacement") @ turn.T)
-                tip[t] = np.repeat(series.at(now, "tip") @ turn.T + shift, 2, axis=0)
-                towards = np.repeat(series.at(now, "shaft") @ turn.T, 2, axis=0)
+                displacement[t] = transfer.move(series.at(time_s, "displacement") @ turn.T)
+                tip[t] = np.repeat(series.at(time_s, "tip") @ turn.T + shift, 2, axis=0)
+                towards = np.repeat(series.at(time_s, "shaft") @ turn.T, 2, axis=0)
                 shaft[t] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
                 if series.force is not None:
-                    force = series.at(now, "force") @ turn.T
+                    force = series.at(time_s, "force") @ turn.T
                     load[t] = transfer.bear(force)
-                    lost[t] = force.sum(axis=0) - load[t].sum(axis=0)
+                    lost_force[t] = force.sum(axis=0) - load[t].sum(axis=0)
                     if count:  # a vertex's load belongs to the nearest tip
-                        away = (rest.surface.vertices + moved[t])[:, None] - tip[t, ::2]
-                        nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
-                        parts[t] = [load[t][nearest == k].sum(axis=0) for k in range(count)]
-                    work[t] = 0.5 * (load[t] * moved[t]).sum()
-        steps = np.linalg.norm(np.diff(moved, axis=0), axis=2).max(axis=1)
-        corners = series.points[series.faces]
-        cell = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-        cautions = list(series.cautions)
-        if (step := float(steps.max())) > cell and not any(
-            caution.startswith("nodes") for caution in cautions
-        ):
-            between = f"from frame {steps.argmax()} to the next, more than a cell of the mesh, {cell:.2g} mm"
-            cautions.append(f"the surface moves by {step:.2g} mm {between}: store more states, or raise fps")
-        whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm
-        outside = float(np.linalg.norm(lost + load[:, hidden].sum(axis=1), axis=1).max())
-        if outside > _LOST * (most := max(float(np.linalg.norm(whole + lost, axis=1).max()), outside)):
-            share = f"{outside:.3g} mN, {100 * outside / most:.0f}% of the load"
-            beyond = f"{np.linalg.norm(lost, axis=1).max():.2f} mN beyond the drawn surface are in no label"
-            cautions.append(f"force: {share}, act outside the opening; {beyond}")
+                        offsets = (rest.surface.vertices + displacement[t])[:, None] - tip[t, ::2]
+                        nearest = np.linalg.norm(offsets, axis=2).argmin(axis=1)
+                        instrument_forces[t] = [load[t][nearest == k].sum(axis=0) for k in range(count)]
+                    work[t] = 0.5 * (load[t] * displacement[t]).sum()
+        cautions = _list_cautions(rest, displacement, load, lost_force)
         for caution in cautions:
             warnings.warn(f"mechanics.source: {caution}", Caution, stacklevel=1)
+        total_force = load.sum(axis=1)
         if series.force is None:
-            for unknown in (load, whole, parts):
-                unknown.fill(np.nan)
+            for values in (load, total_force, instrument_forces):
+                values.fill(np.nan)
         return Deformation(
-            displacement=moved,
+            displacement=displacement,
             traction=load / area[:, None],
-            force=whole,
-            by_instrument=parts,
+            force=total_force,
+            by_instrument=instrument_forces,
             tip=tip,
             shaft=shaft,
             tool_work=None if series.force is None else work,
             cautions=tuple(cautions),
         )
+
+
+def _list_cautions(rest: RestScene, displacement: Floats, load: Floats, lost_force: Floats) -> list[str]:
+    """What is doubtful about a scene's series and its transfer to the drawn surface.
+
+    `displacement` and `load`: (T, V, 3) mm and mN at vertices; `lost_force`: (T, 3) mN beyond the surface.
+    """
+    series = rest.series
+    assert series is not None
+    steps = np.linalg.norm(np.diff(displacement, axis=0), axis=2).max(axis=1)
+    corners = series.points[series.faces]
+    cell = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    cautions = list(series.cautions)
+    if (step := float(steps.max())) > cell and not any(caution.startswith("nodes") for caution in cautions):
+        between = f"from frame {steps.argmax()} to the next, more than a cell of the mesh, {cell:.2g} mm"
+        cautions.append(f"the surface moves by {step:.2g} mm {between}: store more states, or raise fps")
+    total_force = load.sum(axis=1) + lost_force
+    hidden = np.hypot(*rest.surface.vertices[:, :2].T) > rest.draw.opening_mm
+    outside = float(np.linalg.norm(lost_force + load[:, hidden].sum(axis=1), axis=1).max())
+    largest = max(float(np.linalg.norm(total_force, axis=1).max()), outside)
+    if outside > _LOST * largest:
+        share = f"{outside:.3g} mN, {100 * outside / largest:.0f}% of the load"
+        lost = np.linalg.norm(lost_force, axis=1).max()
+        beyond = f"{lost:.2f} mN beyond the drawn surface are in no label"
+        cautions.append(f"force: {share}, act outside the opening; {beyond}")
+    return cautions

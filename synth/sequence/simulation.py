@@ -62,37 +62,37 @@ def simulate(
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
-    stated = any(
+    has_stated_load = any(
         instrument.load or instrument.force_mn or instrument.travel_mm
         for instrument in job.fem.instrument_list
     )
-    drawn = draw(job, index, case=case)
-    driven = any(gesture.drive for gesture in drawn.scenario.gestures)
-    left = 0 if case or stated or not ours else (DRIVEN_ATTEMPTS if driven else ATTEMPTS) - 1
+    sequence_draw = draw(job, index, case=case)
+    driven = any(gesture.drive for gesture in sequence_draw.scenario.gestures)
+    redraws = 0 if case or has_stated_load or not ours else (DRIVEN_ATTEMPTS if driven else ATTEMPTS) - 1
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     mechanics = mechanics or (FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics())
     while True:
         if ours:
-            refuse_untouched(drawn)
+            refuse_untouched(sequence_draw)
         with watch.stage("mesh"):
-            rest = build(drawn, content)
+            rest = build(sequence_draw, content)
         try:
             motion = mechanics.deform(rest, report, watch)
             break
         except ExcessiveLoad:
-            if drawn.scenario.attempt >= left:
+            if sequence_draw.scenario.attempt >= redraws:
                 raise
-            drawn = draw(job, index, drawn.scenario.attempt + 1)
-    acting = len(rest.instruments) - len(drawn.scenario.idle)
-    check_deformation(motion, rest.shape, job.frames, acting, "force" in job.stored_fields)
+            sequence_draw = draw(job, index, sequence_draw.scenario.attempt + 1)
+    acting_count = len(rest.instruments) - len(sequence_draw.scenario.idle)
+    check_deformation(motion, rest.shape, job.frames, acting_count, "force" in job.stored_fields)
     return Scene(**{field.name: getattr(rest, field.name) for field in fields(rest)}, motion=motion)
 
 
-def refuse_untouched(drawn: Draw) -> None:
+def refuse_untouched(sequence_draw: Draw) -> None:
     """Raises UserError for an instrument whose contact falls between two frames."""
-    job = drawn.job
-    for k, gesture in enumerate(drawn.scenario.gestures):
+    job = sequence_draw.job
+    for k, gesture in enumerate(sequence_draw.scenario.gestures):
         if not trajectory(gesture, job.frames).load.max() > 1e-6:
             touch, leave = (f"{part * (job.frames - 1) / job.fps:.3g}" for part in gesture.timing[::3])
             when = f"from {touch} to {leave} s falls between two frames, {1 / job.fps:.3g} s apart"

@@ -34,12 +34,13 @@ class Timeline:
         last = len(self.motion.displacement) - 1
         frame = float(np.clip(frame, 0, last))
         before = int(frame)
-        part = frame - before
+        fraction = frame - before
         after = min(before + 1, last)
 
         def between(values: np.ndarray) -> np.ndarray:
-            mixed = values[before] if part == 0 else (1 - part) * values[before] + part * values[after]
-            return np.asarray(mixed)
+            if fraction == 0:
+                return np.asarray(values[before])
+            return np.asarray((1 - fraction) * values[before] + fraction * values[after])
 
         acting = between(self.motion.tip), between(self.motion.shaft)
         tips, shafts = with_idle(self.idle, frame / self.fps, *acting)

@@ -31,14 +31,17 @@ def folder(name: str) -> Path:
     places = [Path(os.environ["SULCUS_CACHE"])] if "SULCUS_CACHE" in os.environ else []
     places += [Path(user or f"{home}/.cache") / "sulcus"] if user or home else []
     user_id = _user_id()
-    mine = Path(tempfile.gettempdir()) / f"sulcus-{user_id}"
-    for inside in (*(one for place in places for one in (place, place / f"user-{user_id}")), mine):
+    temporary = Path(tempfile.gettempdir()) / f"sulcus-{user_id}"
+    for parent in (
+        *(candidate for place in places for candidate in (place, place / f"user-{user_id}")),
+        temporary,
+    ):
         with suppress(OSError):
-            (inside / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            (inside / name).mkdir(mode=0o700, exist_ok=True)
-            if all(is_private(one) for one in {inside / name, inside} - set(places)):
-                return inside / name
-    raise PermissionError(f"{mine}: is not writable, or not by this user alone")
+            (parent / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (parent / name).mkdir(mode=0o700, exist_ok=True)
+            if all(is_private(candidate) for candidate in {parent / name, parent} - set(places)):
+                return parent / name
+    raise PermissionError(f"{temporary}: is not writable, or not by this user alone")
 
 
 def _user_id() -> int:
@@ -49,13 +52,13 @@ def _user_id() -> int:
 def is_private(folder: Path) -> bool:
     """Whether a folder exists, is no link, and only this user may write to it."""
     with suppress(OSError):
-        about = folder.lstat()
-        own = about.st_uid == _user_id() and not about.st_mode & 0o022
-        return stat.S_ISDIR(about.st_mode) and own and os.access(folder, os.W_OK)
+        status = folder.lstat()
+        is_own = status.st_uid == _user_id() and not status.st_mode & 0o022
+        return stat.S_ISDIR(status.st_mode) and is_own and os.access(folder, os.W_OK)
     return False
 
 
-def cached(
+def load_or_make(
     file: str,
     key: bytes,
     make: Callable[[], T],
@@ -71,20 +74,21 @@ def cached(
     """
     name, ending = file.split("/")
     word = hashlib.sha256(key).hexdigest()[:32]
-    place = folder(name) / f"{word}.{ending}"
+    path = folder(name) / f"{word}.{ending}"
     with suppress(OSError, *faults):
-        return load(place.read_bytes())
-    with ExitStack() as held:
+        return load(path.read_bytes())
+    with ExitStack() as locks:
         # Few locks, as they are never deleted; sharing one only costs time. Windows has none.
         with suppress(OSError, ImportError):
             import fcntl
 
-            fcntl.flock(held.enter_context((place.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
+            fcntl.flock(locks.enter_context((path.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
         with suppress(OSError, *faults):
-            return load(place.read_bytes())
-        made = make()
+            return load(path.read_bytes())
+        result = make()
         with suppress(OSError):
-            write_whole(place, dump(made), durable=False)
-            for old in sorted(place.parent.glob(f"*.{ending}"), key=lambda one: one.stat().st_mtime)[:-most]:
-                old.unlink()
-    return made
+            write_whole(path, dump(result), durable=False)
+            entries = sorted(path.parent.glob(f"*.{ending}"), key=lambda entry: entry.stat().st_mtime)
+            for entry in entries[:-most]:
+                entry.unlink()
+    return result

@@ -44,6 +44,7 @@ _SIZE = "resolution", "imagesize", "imgsize", "imgshape", "imageshape"
 _MODEL = re.compile(r"((distortion|camera|lens|projection)(model|type)|model)(name)?")
 _PINHOLE = "distortion|pinhole|opencv|plumbbob|rad(tan|ialtangential)|brown|conrady|rationalpolynomial|none"
 _OTHER = re.compile("fisheye|omnidir|thinprism|^xi$")  # keys of other models
+_OFF = "", "0", "0.0", "false", "none"  # values of these keys in a file of a pinhole camera
 _INTRINSIC = {*_MATRIX, *_LENS, *chain.from_iterable(_SCALARS)}
 _SIDED = re.compile("(left|right)?(.*?)(left|right|[012])?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -95,41 +96,43 @@ def describe(path: Path) -> list[str]:
     notes = list[str]()
     with suppress(UserError):
         left, right, is_pair = _load(path)
-        for one in (left, right)[: 1 + is_pair]:
-            if one.numbers(_MATRIX, *_SCALARS).size:
+        for camera in (left, right)[: 1 + is_pair]:
+            if camera.numbers(_MATRIX, *_SCALARS).size:
                 notes += (
-                    [] if one.states_distortion else [f"{path.name} states no distortion: it is taken for 0"]
+                    []
+                    if camera.states_distortion
+                    else [f"{path.name} states no distortion: it is taken for 0"]
                 )
-            elif one.numbers([_ANGLE]).size:
+            elif camera.numbers([_ANGLE]).size:
                 notes.append(f"{path.name} states an angle of view only: centre and distortion are assumed")
-            elif one.numbers(_RECTIFIED).size:
+            elif camera.numbers(_RECTIFIED).size:
                 notes.append(f"{path.name} holds P1 and P2 alone: the pictures are taken for rectified ones")
     return list(dict.fromkeys(notes))
 
 
 def _pose(left: _Values, right: _Values) -> tuple[Floats, Floats, float | None]:
     """R (3, 3), T (3,) and its unit of `read_pair`."""
-    both = _Values(left.path, {**left.of, **right.of})
-    rotation, translation = both.numbers(_TURN), both.numbers(_SHIFT)
-    in_metres = not rotation.size and _KALIBR in both.of
-    if in_metres and (moved := both.numbers([_KALIBR])).size == 16:
-        rotation, translation = moved.reshape(4, 4)[:3, :3], moved.reshape(4, 4)[:3, 3]
-    if not rotation.size and (turned := both.numbers([_TURN_ROWS])).size == 9:
-        rotation = turned.reshape(3, 3).T
-    if not rotation.size and (poses := [one.numbers([_POSE]) for one in (left, right)])[1].size == 16:
+    combined = _Values(left.path, {**left.entries, **right.entries})
+    rotation, translation = combined.numbers(_TURN), combined.numbers(_SHIFT)
+    in_metres = not rotation.size and _KALIBR in combined.entries
+    if in_metres and (transform := combined.numbers([_KALIBR])).size == 16:
+        rotation, translation = transform.reshape(4, 4)[:3, :3], transform.reshape(4, 4)[:3, 3]
+    if not rotation.size and (row_rotation := combined.numbers([_TURN_ROWS])).size == 9:
+        rotation = row_rotation.reshape(3, 3).T
+    if not rotation.size and (poses := [camera.numbers([_POSE]) for camera in (left, right)])[1].size == 16:
         to_body = [pose.reshape(4, 4) if pose.size == 16 else np.eye(4) for pose in poses]
         if np.abs(np.linalg.det(to_body)).min() > 0:
-            moved, in_metres = np.linalg.inv(to_body[1]) @ to_body[0], True
-            rotation, translation = moved[:3, :3], moved[:3, 3]
-    if not rotation.size and (flat := right.numbers(_RECTIFIED)).size == 12 and flat[0]:
-        rotation, translation = np.eye(3), flat.reshape(3, 4)[:, 3] / flat[0]
+            transform, in_metres = np.linalg.inv(to_body[1]) @ to_body[0], True
+            rotation, translation = transform[:3, :3], transform[:3, 3]
+    if not rotation.size and (projection := right.numbers(_RECTIFIED)).size == 12 and projection[0]:
+        rotation, translation = np.eye(3), projection.reshape(3, 4)[:, 3] / projection[0]
     if rotation.size == 3:
         rotation = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
     if rotation.size != 9 or translation.size != 3 or not 0 < np.abs(translation).max() < _LARGEST:
-        raise both.error("R or T of the right camera is missing, or has another shape")
+        raise combined.error("R or T of the right camera is missing, or has another shape")
     rotation = rotation.reshape(3, 3)
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHOGONAL or np.linalg.det(rotation) < 0:
-        raise both.error("R is not a rotation")
+        raise combined.error("R is not a rotation")
     return rotation, translation, 1000.0 if in_metres else None
 
 
@@ -137,15 +140,17 @@ class _Values(NamedTuple):
     """Values of one camera by name."""
 
     path: Path
-    of: dict[str, Any]
+    entries: dict[str, Any]
 
     def numbers(self, *names: Iterable[str]) -> Floats:
         """Those of the first name of each group that is there, flat."""
-        chosen = [next((one for one in group if one in self.of), "") for group in names]
+        keys = [next((key for key in group if key in self.entries), "") for group in names]
         try:
-            return np.array([x for name in chosen for x in islice(_flat(self.of.get(name)), 20)], np.float64)
+            return np.array(
+                [x for name in keys for x in islice(_flat(self.entries.get(name)), 20)], np.float64
+            )
         except (TypeError, ValueError, OverflowError, RecursionError):
-            raise self.error(f"{' or '.join(chosen)} is not a matrix of numbers") from None
+            raise self.error(f"{' or '.join(keys)} is not a matrix of numbers") from None
 
     def error(self, fault: str) -> UserError:
         return UserError(f"{self.path}: {fault}")
@@ -153,7 +158,7 @@ class _Values(NamedTuple):
     @property
     def states_distortion(self) -> bool:
         """Whether distortion is given in any form."""
-        return any(name in self.of for name in (*_LENS, *_RADIAL, "k1"))
+        return any(name in self.entries for name in (*_LENS, *_RADIAL, "k1"))
 
     def lens(self, size: tuple[int, int], shifted: bool = False) -> tuple[Floats, Floats]:
         """K and distortion; `shifted`: the principal point may be outside the picture."""
@@ -170,18 +175,20 @@ class _Values(NamedTuple):
                 f"p1, p2 = {lens[2]:g}, {lens[3]:g} is too much: of a fisheye lens, or in another order? "
                 "needed are k1 k2 p1 p2 k3 of a pinhole camera"
             )
-        most = float(np.abs(lens[2:4]).max())
-        if lens.size == 5 and most > _ODD_TANGENTIAL and 0 < abs(lens[4]) < _ODD_RADIAL * most:
+        tangential = float(np.abs(lens[2:4]).max())
+        if lens.size == 5 and tangential > _ODD_TANGENTIAL and 0 < abs(lens[4]) < _ODD_RADIAL * tangential:
             raise self.error(
                 f"k1 k2 p1 p2 k3 = {', '.join(f'{x:g}' for x in lens)}: is k3 before p1 and p2? "
                 "Name the terms, as "
                 "k1: ..., k2: ..., p1: ..., p2: ..., k3: ..."
             )
-        K, made = self._cropped(K, size)
-        scale = np.array(size) / made
+        K, full_size = self._crop(K, size)
+        scale = np.array(size) / full_size
         if abs(scale[0] / scale[1] - 1) > 0.01:
-            of = " x ".join(f"{one:g}" for one in made)
-            raise self.error(f"made from pictures of {of}, whose shape is not that of {size[0]} x {size[1]}")
+            size_text = " x ".join(f"{length:g}" for length in full_size)
+            raise self.error(
+                f"made from pictures of {size_text}, whose shape is not that of {size[0]} x {size[1]}"
+            )
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # centres, not corners, are whole
         K = np.diag([*scale, 1.0]) @ (K + half) - half
         (fx, skew, x), (_, fy, y), _ = K
@@ -203,118 +210,125 @@ class _Values(NamedTuple):
         """K (3, 3) as stated, from the centre of the first pixel."""
         matrix = self.numbers(_MATRIX)
         matrix = matrix if matrix.size else self.numbers(*_SCALARS)
-        if matrix.size == 3 and "fy" not in self.of:  # one focal length
+        if matrix.size == 3 and "fy" not in self.entries:  # one focal length
             matrix = matrix[[0, 0, 1, 2]]
         if not matrix.size and (angle := self.numbers([_ANGLE])).size == 1 and 0 < angle[0] < np.pi:
             focal = 0.5 * size[0] / np.tan(0.5 * angle[0])
             return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
-        if not matrix.size and (flat := self.numbers(_RECTIFIED)).size == 12:
-            return flat.reshape(3, 4)[:, :3]
+        if not matrix.size and (projection := self.numbers(_RECTIFIED)).size == 12:
+            return projection.reshape(3, 4)[:, :3]
         if matrix.size == 4:
             matrix = np.array([matrix[0], 0, matrix[2], 0, matrix[1], matrix[3], 0, 0, 1])
         if matrix.size != 9:
             raise self.error(f"no camera matrix (camera_matrix, K or fx, fy, cx, cy): {matrix.size} numbers")
         K = matrix.reshape(3, 3).copy()
-        if "radialdistortion" in self.of and "tangentialdistortion" in self.of:  # MATLAB counts from 1
+        # MATLAB counts from 1.
+        if "radialdistortion" in self.entries and "tangentialdistortion" in self.entries:
             K = K.T.copy() if not K[:2, 2].any() else K
             K[:2, 2] -= 1
-        if any(name in self.of for name in _CORNER):
+        if any(name in self.entries for name in _CORNER):
             K[:2, 2] -= 0.5
         return K
 
     def _distortion(self) -> Floats:
         """k1, k2, p1, p2, ...: as one list, by name, or radial and tangential apart; 0 if it isn't stated."""
         lens = self.numbers(_LENS)
-        if not lens.size and "k1" in self.of:
-            lens = np.array([self.numbers([name])[0] if name in self.of else 0.0 for name in _TERMS])
+        if not lens.size and "k1" in self.entries:
+            lens = np.array([self.numbers([name])[0] if name in self.entries else 0.0 for name in _TERMS])
         radial, tangential = self.numbers(_RADIAL), self.numbers(_TANGENTIAL)
         if not lens.size and radial.size in (2, 3) and tangential.size in (0, 2):
             sides = tangential if tangential.size else np.zeros(2)
             lens = np.array([*radial[:2], *sides, *(radial[2:] if radial.size == 3 else [0.0])])
-        if not lens.size and not any(name in self.of for name in (*_LENS, *_RADIAL)):
+        if not lens.size and not any(name in self.entries for name in (*_LENS, *_RADIAL)):
             lens = np.zeros(5)
         if lens.size not in (4, 5, 8, 12, 14) or not (np.abs(lens) < _LARGEST).all():
             raise self.error(f"{lens.size} distortion coefficients, needed are k1 k2 p1 p2, perhaps k3 ...")
         return lens
 
-    def _cropped(self, K: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    def _crop(self, K: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
         """K of the pictures that were calibrated, and their size (2,): a ROS region, binned, of the
         sensor."""
-        made = self.numbers(_WIDTH, _HEIGHT) if self.numbers(_WIDTH).size else self.numbers(_SIZE)
-        if made.size and not (made.size == 2 and (made >= 1).all()):
-            of = " x ".join(f"{one:g}" for one in made)
-            raise self.error(f"made from pictures of {of}, whose shape is not that of {size[0]} x {size[1]}")
-        made = made if made.size else np.array(size, np.float64)
-        if abs(size[0] * made[0] / (size[1] * made[1]) - 1) < 0.01 and not self.numbers(_WIDTH).size:
-            made = made[::-1]  # rows first
-        area = self.of.get("roi") if isinstance(self.of.get("roi"), dict) else {}
+        full_size = self.numbers(_WIDTH, _HEIGHT) if self.numbers(_WIDTH).size else self.numbers(_SIZE)
+        if full_size.size and not (full_size.size == 2 and (full_size >= 1).all()):
+            size_text = " x ".join(f"{length:g}" for length in full_size)
+            raise self.error(
+                f"made from pictures of {size_text}, whose shape is not that of {size[0]} x {size[1]}"
+            )
+        full_size = full_size if full_size.size else np.array(size, np.float64)
+        if (
+            abs(size[0] * full_size[0] / (size[1] * full_size[1]) - 1) < 0.01
+            and not self.numbers(_WIDTH).size
+        ):
+            full_size = full_size[::-1]  # rows first
+        area = self.entries.get("roi") if isinstance(self.entries.get("roi"), dict) else {}
         values = _Values(
             self.path, {re.sub("[^a-z]", "", str(k).lower()): v for k, v in (area or {}).items()}
         )
-        binned = np.array([*self.numbers(["binningx"]), *self.numbers(["binningy"])])
-        binned = np.maximum(binned, 1) if binned.size == 2 else np.ones(2)
-        corner, part = values.numbers(["xoffset"], ["yoffset"]), values.numbers(["width"], ["height"])
+        binning = np.array([*self.numbers(["binningx"]), *self.numbers(["binningy"])])
+        binning = np.maximum(binning, 1) if binning.size == 2 else np.ones(2)
+        corner, region_size = values.numbers(["xoffset"], ["yoffset"]), values.numbers(["width"], ["height"])
         corner = corner if corner.size == 2 else np.zeros(2)
-        part = part if part.size == 2 and part.all() else made
-        if (binned == 1).all() and not corner.any() and (part == made).all():
-            return K, made
-        shown = part // binned
-        if (shown != size).any():
+        region_size = region_size if region_size.size == 2 and region_size.all() else full_size
+        if (binning == 1).all() and not corner.any() and (region_size == full_size).all():
+            return K, full_size
+        picture_size = region_size // binning
+        if (picture_size != size).any():
             raise self.error(
-                f"of {shown[0]:g} x {shown[1]:g} px, a region (roi) or binning of its sensor of "
-                f"{made[0]:g} x "
-                f"{made[1]:g}, but the pictures are {size[0]} x {size[1]}"
+                f"of {picture_size[0]:g} x {picture_size[1]:g} px, a region (roi) or binning of its sensor "
+                f"of {full_size[0]:g} x {full_size[1]:g}, but the pictures are {size[0]} x {size[1]}"
             )
-        return crop_matrix(K, corner, binned), shown
+        return crop_matrix(K, corner, binning), picture_size
 
 
-def crop_matrix(K: Floats, corner: Floats, binned: Floats) -> Floats:
+def crop_matrix(K: Floats, corner: Floats, binning: Floats) -> Floats:
     """The camera matrix (3, 3) px of a region of the sensor from a corner (x, y) px, binned (x, y)."""
     K = K.copy()
-    K[:2, 2] = (K[:2, 2] - corner + 0.5) / binned - 0.5
-    K[[0, 1], [0, 1]] /= binned
+    K[:2, 2] = (K[:2, 2] - corner + 0.5) / binning - 0.5
+    K[[0, 1], [0, 1]] /= binning
     return K
 
 
 def _load(path: Path) -> tuple[_Values, _Values, bool]:
     """Values of the left and right camera, each with those of none, and whether there is a right one."""
-    return _parsed(path, checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip())
+    return _parse(path, checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip())
 
 
 @lru_cache(maxsize=4)  # every sequence of a job reads its calibration several times
-def _parsed(path: Path, text: str) -> tuple[_Values, _Values, bool]:
+def _parse(path: Path, text: str) -> tuple[_Values, _Values, bool]:
     if re.search(r"^\[(LEFT|RIGHT)_CAM_\w+\]", text, re.MULTILINE):
         raise UserError(
             f"{path}: of a ZED camera, for several sizes: write the matrices of yours, as its SDK "
             "gives them, as "
             "K1, D1, K2, D2, R, T"
         )
-    found: Any = _of_text(path, text)
+    tree: Any = _of_text(path, text)
     with as_user_error(f"{path}: is no calibration in XML, JSON or INI"):
         if text.startswith("<"):
-            found = _of_metashape(path, _tree(ElementTree.fromstring(text)))
+            tree = _of_metashape(path, _tree(ElementTree.fromstring(text)))
         elif text.startswith("{"):
-            found = json.loads(text)
-        elif found is None and path.suffix.lower() == ".ini":
+            tree = json.loads(text)
+        elif tree is None and path.suffix.lower() == ".ini":
             parser = configparser.ConfigParser(interpolation=None, strict=False)
             parser.read_string(text)
-            found = {name: dict(parser[name]) for name in parser.sections()}
-    if found is None:
+            tree = {name: dict(parser[name]) for name in parser.sections()}
+    if tree is None:
         # Long matrices as text, which is read much faster; OpenCV's head and tags are not YAML.
         text = re.sub(r"\bdata:\s*\[([^][\"]*)\]", r'data: "\1"', text.removesuffix("\n---"))
         text = re.sub(r"\A%YAML.*\n(---.*\n)?|!!opencv-\S+", "", text)
-        found = checked_file.load_yaml(text, str(path))
-    if not isinstance(found, dict):
+        tree = checked_file.load_yaml(text, str(path))
+    if not isinstance(tree, dict):
         raise UserError(f"{path}: holds no named values")
-    held = sorted(_collected(path, found), key=lambda one: one[0] != "")  # a camera's own values come last
-    first = 0 if any(side == "0" for side, _, _ in held) else 1
+    entries = sorted(
+        _collect(path, tree), key=lambda entry: entry[0] != ""
+    )  # a camera's own values come last
+    first = 0 if any(side == "0" for side, _, _ in entries) else 1
     sides = ("", "left", str(first)), ("", "right", str(first + 1))
-    given: dict[tuple[str, str], Any] = {}
-    for side, name, value in held:
-        if name in _INTRINSIC and given.setdefault((side, name), value) != value:
+    intrinsics: dict[tuple[str, str], Any] = {}
+    for side, name, value in entries:
+        if name in _INTRINSIC and intrinsics.setdefault((side, name), value) != value:
             raise UserError(f"{path}: {name} of one camera is given twice; leave those of the video's size")
-    left, right = ({name: value for side, name, value in held if side in one} for one in sides)
-    is_pair = any(side in sides[1][1:] for side, _, _ in held)
+    left, right = ({name: value for side, name, value in entries if side in labels} for labels in sides)
+    is_pair = any(side in sides[1][1:] for side, _, _ in entries)
     return _Values(path, left), _Values(path, right), is_pair
 
 
@@ -333,15 +347,15 @@ def _of_text(path: Path, text: str) -> dict[str, Any] | None:
             ("image_height", "height", 1),
             ("camera_matrix", "camera matrix", 9),
         )
-        found = {name: block(key, count) for name, key, count in (*fields, ("distortion", "distortion", 14))}
-        return {name: value for name, value in found.items() if value}
-    printed = re.fullmatch(
+        blocks = {name: block(key, count) for name, key, count in (*fields, ("distortion", "distortion", 14))}
+        return {name: value for name, value in blocks.items() if value}
+    line_match = re.fullmatch(
         r"\[\s*(\d+)x(\d+)\s+p\[(\S+) (\S+)\]\s+f\[(\S+) (\S+)\]\s+([A-Za-z ]+?)\s*\[([^\]]*)\]\s*\]", text
     )
-    if printed:
-        width, height, x, y, fx, fy, model, terms = printed.groups()
-        stated = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": x, "cy": y}
-        return stated | {"distortion_model": model, "coeffs": terms}
+    if line_match:
+        width, height, x, y, fx, fy, model, terms = line_match.groups()
+        intrinsics = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": x, "cy": y}
+        return intrinsics | {"distortion_model": model, "coeffs": terms}
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if all(len(row) > 4 and row[0].isdigit() and row[1].isupper() for row in rows) and rows:
         if len(rows) > 1:
@@ -363,20 +377,20 @@ def _of_text(path: Path, text: str) -> dict[str, Any] | None:
     return None
 
 
-def _of_metashape(path: Path, found: Any) -> Any:
+def _of_metashape(path: Path, tree: Any) -> Any:
     """Values of Metashape's XML, whose centre is relative and whose p1, p2 are exchanged; others as they
     are."""
-    if not isinstance(found, dict) or not {"projection", "f", "cx"} <= found.keys():
-        return found
-    if found["projection"] != "frame":
-        raise UserError(f"{path}: projection {found['projection']}: calibrate with a pinhole model (frame)")
-    values = {name: float(text) for name, text in found.items() if _NUMBER.fullmatch(str(text))}
+    if not isinstance(tree, dict) or not {"projection", "f", "cx"} <= tree.keys():
+        return tree
+    if tree["projection"] != "frame":
+        raise UserError(f"{path}: projection {tree['projection']}: calibrate with a pinhole model (frame)")
+    values = {name: float(text) for name, text in tree.items() if _NUMBER.fullmatch(str(text))}
     if values.get("b1") or values.get("b2") or values.get("k4"):
         raise UserError(f"{path}: b1, b2 or k4 is not 0: calibrate without them")
     width, height = values["width"], values["height"]
     terms = {"k1": "k1", "k2": "k2", "p1": "p2", "p2": "p1", "k3": "k3"}
     return {
-        **{name: values.get(own, 0.0) for name, own in terms.items()},
+        **{name: values.get(source, 0.0) for name, source in terms.items()},
         "fx": values["f"],
         "fy": values["f"],
         "cx": 0.5 * width + values.get("cx", 0.0) - 0.5,
@@ -390,10 +404,10 @@ def _tree(node: ElementTree.Element) -> Any:
     return {child.tag: _tree(child) for child in node} or node.text
 
 
-def _collected(path: Path, found: Any, side: str = "", depth: int = 4) -> Iterator[tuple[str, str, Any]]:
+def _collect(path: Path, tree: Any, side: str = "", depth: int = 4) -> Iterator[tuple[str, str, Any]]:
     """Side, name and value of each entry of nested maps. UserError for the name of another camera model."""
     rows: dict[str, list[Any]] = {}
-    inner_first = sorted(found.items(), key=lambda one: not isinstance(one[1], dict))
+    inner_first = sorted(tree.items(), key=lambda item: not isinstance(item[1], dict))
     for key, value in inner_first:  # and outer values last, which override them
         lower, scalar = str(key).lower(), not isinstance(value, (dict, list))
         word = re.sub("[^a-z0-9]", "", lower)
@@ -401,31 +415,31 @@ def _collected(path: Path, found: Any, side: str = "", depth: int = 4) -> Iterat
             rows.setdefault(lower[:-2], []).append(value)
             continue
         match = None if word == _KALIBR or (scalar and word in _TERMS) else _SIDED.fullmatch(word)
-        name, own = (match[2], match[1] or match[3] or "") if match else (word, "")
+        name, entry_side = (match[2], match[1] or match[3] or "") if match else (word, "")
         if isinstance(value, str) and _MODEL.fullmatch(name):
             model = re.sub("[^a-z0-9]", "", value.lower())
-            if "inverse" in model and not any(_terms(found)):
+            if "inverse" in model and not any(_terms(tree)):
                 model = "none"  # of RealSense, whose pictures are free of distortion
-            other = not re.fullmatch(f"({_PINHOLE})+", model)
+            is_other = not re.fullmatch(f"({_PINHOLE})+", model)
         else:
-            other = bool(_OTHER.search(word)) and str(value).lower() not in ("", "0", "0.0", "false", "none")
-        if other:
+            is_other = bool(_OTHER.search(word)) and str(value).lower() not in _OFF
+        if is_other:
             raise UserError(f"{path}: {key} is {value}: calibrate with a pinhole model (radtan, plumb_bob)")
-        if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
-            value = {str(k): one for k, one in enumerate(value)}
+        if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+            value = {str(k): item for k, item in enumerate(value)}
         if name == "roi":
-            yield own or side, name, value
+            yield entry_side or side, name, value
         elif isinstance(value, dict) and "data" not in value and depth:
-            yield from _collected(path, value, own or side, depth - 1)
-        elif not (own and name in (*_TURN, *_SHIFT[:3])):  # R1 and R2 are of rectification
-            yield own or side, name, value
+            yield from _collect(path, value, entry_side or side, depth - 1)
+        elif not (entry_side and name in (*_TURN, *_SHIFT[:3])):  # R1 and R2 are of rectification
+            yield entry_side or side, name, value
     for name, values in rows.items():
         yield side, name, values
 
 
-def _terms(found: Any) -> list[float]:
+def _terms(tree: Any) -> list[float]:
     """The distortion next to a model's name; not 0 if it can't be read."""
-    for key, value in found.items():
+    for key, value in tree.items():
         if re.sub("[^a-z0-9]", "", str(key).lower()) in _LENS:
             with suppress(TypeError, ValueError):
                 return list(_flat(value))
@@ -439,7 +453,7 @@ def _flat(value: Any) -> Iterator[float]:
     if isinstance(value, str):
         yield from map(float, _NUMBER.findall(value))
     elif isinstance(value, list):
-        for one in value:
-            yield from _flat(one)
+        for item in value:
+            yield from _flat(item)
     elif value is not None:
         yield float(value)

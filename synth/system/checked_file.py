@@ -41,8 +41,8 @@ def open_file(path: Path, largest: int) -> BufferedReader:
     except (OSError, ValueError) as error:
         why = str(getattr(error, "strerror", None) or error).lower()
         raise UserError(f"{path}: {why}") from None
-    about = os.fstat(file.fileno())
-    if stat.S_ISREG(about.st_mode) and about.st_size <= largest:
+    status = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and status.st_size <= largest:
         return file
     file.close()
     raise UserError(f"{path}: is no regular file of at most {largest / 1e6:.3g} MB")
@@ -94,11 +94,11 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
             raise KeyError(name)
         with open_file(self.path, _LARGEST_ARRAYS) as file, as_user_error(f"{self.path}: cannot be read"):
             refuse_excess(math.prod(self.shapes[name]) * self.types[name].itemsize)
-            with np.load(file, allow_pickle=False) as held:
-                found = np.asarray(held[name])
-            if found.shape != self.shapes[name]:
+            with np.load(file, allow_pickle=False) as archive:
+                array = np.asarray(archive[name])
+            if array.shape != self.shapes[name]:
                 raise ValueError(f"{name} has changed meanwhile")
-            return found
+            return array
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.shapes)
@@ -121,15 +121,15 @@ def _read_head(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[
         raise ValueError(f"{entry.filename} is not an array of numbers")
     with archive.open(entry) as file:
         np.lib.format.read_magic(file)
-        read = (
+        read_header = (
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
-        shape, _, dtype = read(file)
+        shape, _, dtype = read_header(file)
     if dtype.kind not in "biuf":
         raise ValueError(f"{entry.filename.removesuffix('.npy')} is not an array of numbers")
-    stated = (10 if version == (1, 0) else 12) + size + math.prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or stated != entry.file_size:
-        raise ValueError(f"{entry.filename} has {entry.file_size} bytes, its header states {stated}")
+    stated_bytes = (10 if version == (1, 0) else 12) + size + math.prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or stated_bytes != entry.file_size:
+        raise ValueError(f"{entry.filename} has {entry.file_size} bytes, its header states {stated_bytes}")
     return shape, dtype
 
 
@@ -155,12 +155,12 @@ def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
             warnings.simplefilter("ignore")  # Pillow's own limit is higher
             with Image.open(BytesIO(data)) as picture:
                 refuse_large(*picture.size)
-        found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except Exception as error:  # readers of formats raise anything: SyntaxError, struct.error, ...
         raise ValueError(f"unknown format: {first_line(error).split(' <_io')[0]}") from error
-    if found is None:
+    if pixels is None:
         raise ValueError("it is damaged")
-    return np.asarray(found)
+    return np.asarray(pixels)
 
 
 def refuse_large(width: int, height: int) -> None:
@@ -186,8 +186,8 @@ def load_yaml(text: str, label: str, *, places: bool = False) -> Any:
         return yaml.load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
-        raise UserError(f"{where}: not YAML: {first_line(error.problem or error.context)}") from None
+        place = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
+        raise UserError(f"{place}: not YAML: {first_line(error.problem or error.context)}") from None
     except Exception as error:  # the parser raises ValueError and others for odd scalars and tags
         raise UserError(f"{label}: not YAML: {first_line(error)}") from error
 
@@ -269,12 +269,12 @@ def _sweep_parts(path: Path) -> None:
         with suppress(OSError):
             descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
-                free = _lock(descriptor)
-                if free:
+                acquired = _lock(descriptor)
+                if acquired:
                     shutil.rmtree(part)
-                elif free is None:  # no locks on this file system
-                    left = f"{part}: was left by a process that was killed, or another one writes to it"
-                    warnings.warn(f"{left}; delete it in the first case", Caution, stacklevel=1)
+                elif acquired is None:  # no locks on this file system
+                    message = f"{part}: was left by a process that was killed, or another one writes to it"
+                    warnings.warn(f"{message}; delete it in the first case", Caution, stacklevel=1)
             finally:
                 os.close(descriptor)
 
@@ -304,14 +304,14 @@ def make_folder(path: Path, space_bytes: int = 0) -> None:
 
 
 @contextmanager
-def made_folder(path: Path, space_bytes: int = 0) -> Iterator[None]:
+def open_folder(path: Path, space_bytes: int = 0) -> Iterator[None]:
     """As `make_folder`; if the block fails, the created folders that are still empty are deleted."""
-    fresh = [one for one in (path, *path.parents) if not os.path.lexists(one)]
+    created = [parent for parent in (path, *path.parents) if not os.path.lexists(parent)]
     try:
         make_folder(path, space_bytes)
         yield
     except BaseException:
         with suppress(OSError):
-            for one in fresh:
-                one.rmdir()
+            for parent in created:
+                parent.rmdir()
         raise

@@ -33,7 +33,9 @@ class Commands(TyperGroup):
         """Writes the commands with their whole first sentences, which click would truncate."""
         commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, one.get_short_help_str(1000)) for name, one in commands if one])
+            formatter.write_dl(
+                [(name, command.get_short_help_str(1000)) for name, command in commands if command]
+            )
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -59,7 +61,7 @@ class Commands(TyperGroup):
         except OSError as error:
             if error.errno not in _MACHINE:
                 raise
-            message = ": ".join(str(one) for one in (error.filename, error.strerror) if one is not None)
+            message = ": ".join(str(part) for part in (error.filename, error.strerror) if part is not None)
         except MemoryError:
             message = "out of memory: use a smaller size or fewer workers"
         typer.echo(f"error: {printable(message)}", err=True)
@@ -72,11 +74,13 @@ def _cautions() -> Iterator[None]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def print_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        def print_warning(
+            message: Warning | str, category: type[Warning], *details: Any, **options: Any
+        ) -> None:
             if issubclass(category, Caution):
                 typer.echo(f"note: {printable(str(message))}", err=True)
             else:
-                show(message, category, *where, **more)
+                show(message, category, *details, **options)
 
         warnings.showwarning = print_warning
         yield

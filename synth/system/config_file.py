@@ -25,11 +25,11 @@ Loc = tuple[str | int, ...]  # path of a value in a configuration: keys and list
 class Mistake:
     """An error in a configuration."""
 
-    at: Loc
+    loc: Loc
     what: str
 
     def __str__(self) -> str:
-        return f"{dotted(self.at)}: {self.what}" if self.at else self.what
+        return f"{join_loc(self.loc)}: {self.what}" if self.loc else self.what
 
 
 class ConfigFile:
@@ -47,18 +47,18 @@ class ConfigFile:
         """Replaces values by `section.key=value`, the value in YAML. UserError for other text."""
         for text in changes:
             key, equals, value = text.partition("=")
-            at: Loc = tuple(key.strip().split("."))
-            if not equals or not all(at):
+            loc: Loc = tuple(key.strip().split("."))
+            if not equals or not all(loc):
                 raise UserError(f"{text}: an override is written section.key=value")
-            new = checked_file.load_yaml(value, text)
+            new_value = checked_file.load_yaml(value, text)
             for tree in (self.values, self._tree):
                 block: Any = tree
-                for step in at[:-1]:
+                for step in loc[:-1]:
                     if not isinstance(block.get(step), dict):
                         block[step] = type(block)()
                     block = block[step]
-                block[at[-1]] = new
-            self.changes[at] = text
+                block[loc[-1]] = new_value
+            self.changes[loc] = text
 
     def dump(self) -> str:
         """The YAML text with its comments and with the changes."""
@@ -70,20 +70,20 @@ class ConfigFile:
     def validate(self, model: type[Model], further: Iterable[Mistake] = ()) -> Model:
         """The validated model. UserError: a line for each error, and `further` ones, in the file's order:
         `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`"""
-        mistakes, made = list(further), None
+        mistakes, instance = list(further), None
         try:
-            made = model.model_validate(self.values)
+            instance = model.model_validate(self.values)
         except ValidationError as error:
             mistakes += _find_mistakes(error, model, self.values)
-        if mistakes or made is None:
-            lines = sorted({(*self._place(one.at), str(one)) for one in mistakes})
-            raise UserError("\n".join(f"{where}{what}" for _, where, what in lines))
-        return made
+        if mistakes or instance is None:
+            lines = sorted({(*self._place(mistake.loc), str(mistake)) for mistake in mistakes})
+            raise UserError("\n".join(f"{position}{message}" for _, position, message in lines))
+        return instance
 
-    def _place(self, at: Loc) -> tuple[float, str]:
+    def _place(self, loc: Loc) -> tuple[float, str]:
         """Sorting key and text of an error's place: an override, or a line and column of the file."""
         block, line, column, missing = self._tree, 0, 0, False
-        for step in at:
+        for step in loc:
             positions = getattr(getattr(block, "lc", None), "data", None) or {}
             missing = step not in positions
             if missing:
@@ -91,7 +91,7 @@ class ConfigFile:
             line, column = positions[step][:2]
             block = block[step]
         for place, text in self.changes.items():  # for an unknown section: a part of an override
-            if at[: len(place)] == place or (missing and place[: len(at)] == at):
+            if loc[: len(place)] == place or (missing and place[: len(loc)] == loc):
                 return math.inf, f"'{text}': "
         return line, f"{self._label}:{line + 1}:{column + 1}: " if self._label else ""
 
@@ -106,11 +106,11 @@ def override(settings: Model, changes: Iterable[str]) -> Model:
 
 def first_mistake(error: ValidationError) -> str:
     """The first error in a file that a program wrote, in one line."""
-    found = error.errors(include_url=False)[0]
-    return first_line(Mistake(found["loc"], found["msg"]))
+    detail = error.errors(include_url=False)[0]
+    return first_line(Mistake(detail["loc"], detail["msg"]))
 
 
-def validated(kind: type[T], values: Any, label: str, context: object = None) -> T:
+def validate_values(kind: type[T], values: Any, label: str, context: object = None) -> T:
     """`values` as a model or dataclass. UserError: `label`, with the first mistake in parentheses."""
     try:
         return TypeAdapter(kind).validate_python(values, context=context)
@@ -122,50 +122,54 @@ def _find_mistakes(
     error: ValidationError, model: type[BaseModel], values: dict[str, Any]
 ) -> Iterator[Mistake]:
     """pydantic's messages with their paths in `values`; for an unknown key with a suggestion."""
-    found: dict[Loc, list[str]] = {}
+    messages: dict[Loc, list[str]] = {}
     errors = error.errors(include_url=False)
-    for one in errors:
-        if one["type"] == "too_short" and any(other["loc"][:-1] == one["loc"] for other in errors):
+    for detail in errors:
+        if detail["type"] == "too_short" and any(other["loc"][:-1] == detail["loc"] for other in errors):
             continue  # what is wrong is an item, not their number
         block: Any = values
-        at: Loc = ()
-        for step in one["loc"]:  # in which pydantic includes names of validators and members of unions
+        loc: Loc = ()
+        for step in detail["loc"]:  # in which pydantic includes names of validators and members of unions
             steps = range(len(block)) if isinstance(block, list | tuple) else block
             if isinstance(steps, range | dict) and step in steps:
-                at, block = (*at, step), block[step]
-        if one["type"] == "missing":
-            at = (*at, one["loc"][-1])
-        unknown = one["type"] == "extra_forbidden"
-        what = f"unknown key{_meant(at, model)}" if unknown else one["msg"].removeprefix("Value error, ")
-        found.setdefault(at, []).append(what)
-    return (Mistake(at, ", or ".join(dict.fromkeys(each))) for at, each in found.items())
+                loc, block = (*loc, step), block[step]
+        if detail["type"] == "missing":
+            loc = (*loc, detail["loc"][-1])
+        unknown = detail["type"] == "extra_forbidden"
+        message = detail["msg"].removeprefix("Value error, ")
+        if unknown:
+            message = f"unknown key{_suggest_key(loc, model)}"
+        messages.setdefault(loc, []).append(message)
+    return (Mistake(loc, ", or ".join(dict.fromkeys(texts))) for loc, texts in messages.items())
 
 
-def _meant(at: Loc, model: type[BaseModel]) -> str:
+def _suggest_key(loc: Loc, model: type[BaseModel]) -> str:
     """A suggestion for an unknown key: a similar one in its block, or the same in another block."""
-    known = places(model)
-    elsewhere = [dotted(place) for place in known if place[-1] == at[-1]]
-    hint = did_you_mean(str(at[-1]), [str(place[-1]) for place in known if place[:-1] == at[:-1]])
+    keys = list_keys(model)
+    elsewhere = [join_loc(place) for place in keys if place[-1] == loc[-1]]
+    hint = did_you_mean(str(loc[-1]), [str(place[-1]) for place in keys if place[:-1] == loc[:-1]])
     return hint or (f"; did you mean '{elsewhere[0]}'?" if elsewhere else "")
 
 
 def section_of(annotation: Any) -> type[BaseModel] | None:
     """The model in a field's type (also if optional), if any."""
     options = (annotation, *typing.get_args(annotation))
-    return next((one for one in options if isinstance(one, type) and issubclass(one, BaseModel)), None)
+    return next(
+        (option for option in options if isinstance(option, type) and issubclass(option, BaseModel)), None
+    )
 
 
-def places(model: type[BaseModel], at: Loc = ()) -> list[Loc]:
+def list_keys(model: type[BaseModel], loc: Loc = ()) -> list[Loc]:
     """All keys of a model, except in lists: ("seed",), ("render",), ("render", "spp"), ..."""
-    found: list[Loc] = []
+    keys: list[Loc] = []
     for name, field in model.model_fields.items():
-        found.append((*at, name))
+        keys.append((*loc, name))
         inner = section_of(field.annotation)
         if inner is not None and typing.get_origin(field.annotation) is not tuple:
-            found += places(inner, (*at, name))
-    return found
+            keys += list_keys(inner, (*loc, name))
+    return keys
 
 
-def dotted(at: Loc) -> str:
+def join_loc(loc: Loc) -> str:
     """A path as text: `fem.load[1]`."""
-    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in at).removeprefix(".")
+    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")

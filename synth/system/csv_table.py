@@ -35,27 +35,27 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
     header, rows = _split(path)
     missing = [name for name in required if header.count(name) != 1]
     if missing:
-        there = ", ".join(header)[:200]
-        raise UserError(f"{path}:1: missing column {', '.join(missing)}; the header is {there!r}")
-    wanted = [name for name in (*required, *optional) if name in header]
-    columns = [header.index(name) for name in wanted]
-    cells: list[list[str]] = [[] for _ in wanted]
+        header_text = ", ".join(header)[:200]
+        raise UserError(f"{path}:1: missing column {', '.join(missing)}; the header is {header_text!r}")
+    names = [name for name in (*required, *optional) if name in header]
+    columns = [header.index(name) for name in names]
+    cells: list[list[str]] = [[] for _ in names]
     lines: list[int] = []
     try:
         for row in rows:
             if "".join(row).strip():
-                over = "." not in "".join(row) and "".join(row[len(header) :]).strip()
-                if over or len(row) <= max(columns):
-                    why = "decimal commas? use points" if over else "cut off?"
+                has_extra = "." not in "".join(row) and "".join(row[len(header) :]).strip()
+                if has_extra or len(row) <= max(columns):
+                    why = "decimal commas? use points" if has_extra else "cut off?"
                     raise ValueError(f"{len(row)} cells, {len(header)} expected ({why})")
                 lines.append(rows.line_num)
-                for held, k in zip(cells, columns, strict=True):
-                    held.append(row[k])
+                for column, k in zip(cells, columns, strict=True):
+                    column.append(row[k])
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path}:{rows.line_num}: {str(error)[:100]}") from None
     if not lines:
         raise UserError(f"{path}: a header but no rows")
-    return dict(zip(wanted, parse_columns(path, cells, lines), strict=True))
+    return dict(zip(names, parse_columns(path, cells, lines), strict=True))
 
 
 def read_header(path: Path) -> list[str]:
@@ -83,22 +83,22 @@ def parse_columns(path: Path, columns: Sequence[Sequence[str]], lines: Sequence[
     Decimal commas and thousands are told apart by each column's other cells, or else by other columns.
     UserError: a cell is no number, or may be one of two.
     """
-    found, marks = [], []
+    parsed, marks = [], []
     for cells in columns:
-        values, odd = np.full(len(cells), np.nan), list[int]()
+        values, unparsed = np.full(len(cells), np.nan), list[int]()
         for k, cell in enumerate(cells):
             try:
                 values[k] = float(cell)
             except ValueError:
-                odd.append(k)
-        found.append((values, odd))
-        with_commas = any("," in cells[k] for k in odd)
+                unparsed.append(k)
+        parsed.append((values, unparsed))
+        with_commas = any("," in cells[k] for k in unparsed)
         marks.append(_decimal_mark(path, cells, lines) if with_commas else ".")
     certain = {mark for mark in marks if mark in (",", ";")}
-    for cells, (values, odd), mark in zip(columns, found, marks, strict=True):
+    for cells, (values, unparsed), mark in zip(columns, parsed, marks, strict=True):
         if mark == "?":
             if len(certain) != 1:
-                k = next(k for k in odd if "," in cells[k])
+                k = next(k for k in unparsed if "," in cells[k])
                 raise UserError(
                     f"{path}:{lines[k]}: {cells[k].strip()} may be a thousand or have decimals: "
                     "write numbers "
@@ -106,13 +106,13 @@ def parse_columns(path: Path, columns: Sequence[Sequence[str]], lines: Sequence[
                 )
             mark = certain.copy().pop()
         if mark == ",":  # points are then thousands
-            odd = sorted({*odd, *(k for k, cell in enumerate(cells) if "." in cell)})
-        for k in odd:
+            unparsed = sorted({*unparsed, *(k for k, cell in enumerate(cells) if "." in cell)})
+        for k in unparsed:
             try:
                 values[k] = parse_number(cells[k], "," if mark == "," else ".")
             except ValueError as error:
                 raise UserError(f"{path}:{lines[k]}: {str(error)[:100]}") from None
-    return [values for values, _ in found]
+    return [values for values, _ in parsed]
 
 
 def _decimal_mark(path: Path, cells: Sequence[str], lines: Sequence[int]) -> str:
@@ -120,13 +120,13 @@ def _decimal_mark(path: Path, cells: Sequence[str], lines: Sequence[int]) -> str
 
     UserError if cells contradict each other.
     """
-    decimal, thousands, whole = 0, 0, False  # the last lines that show it
+    decimal, thousands, has_integers = 0, 0, False  # the last lines that show it
     for line, cell in zip(lines, cells, strict=True):
         text = re.split("[eEdD]", _SPACES.sub("", cell.strip()))[0]
         if not _PLAIN.fullmatch(text):
             continue
         if "," not in text:
-            whole |= "." not in text
+            has_integers |= "." not in text
             if "." in text and not _GROUPS.fullmatch(text):
                 thousands = line
         elif text.count(",") > 1 or -1 < text.find(",") < text.rfind("."):
@@ -142,7 +142,7 @@ def _decimal_mark(path: Path, cells: Sequence[str], lines: Sequence[int]) -> str
     small = all(
         len(re.sub("[^0-9]", "", c)) <= 3 for c in cells if "," not in c and _PLAIN.fullmatch(c.strip())
     )
-    return ";" if whole and small else "?"
+    return ";" if has_integers and small else "?"
 
 
 def parse_number(cell: str, decimal: str) -> float:
@@ -157,8 +157,8 @@ def parse_number(cell: str, decimal: str) -> float:
     group = "," if decimal == "." else "."
     head = re.split("[eE]", text)[0]
     if _PLAIN.fullmatch(head):
-        whole, mark, _ = head.partition(decimal)
-        if group in head and not (_GROUPS.fullmatch(whole) and group not in head[len(whole) :]):
+        integer, mark, _ = head.partition(decimal)
+        if group in head and not (_GROUPS.fullmatch(integer) and group not in head[len(integer) :]):
             raise ValueError(f"{cell.strip()!r} is not a number with {decimal!r} as decimal mark")
         return float(text.replace(group, "").replace(decimal, ".") if mark else text.replace(group, ""))
     try:

@@ -41,14 +41,14 @@ def diagnose(folder: Path) -> list[Diagnosis]:
         ("compiled kernels", lambda: [_kernels()]),
         ("packages", lambda: [Diagnosis(name, version) for name, version in packages.versions().items()]),
     )
-    found = list[Diagnosis]()
+    diagnoses = list[Diagnosis]()
     for what, examine in parts:
         try:
-            found += examine()
+            diagnoses += examine()
         except Exception as error:  # of another system: the report is about what doesn't work
             why = f"can't be examined here ({type(error).__name__}: {first_line(error)})"
-            found.append(Diagnosis(what, why, False, _ELSEWHERE))
-    return found
+            diagnoses.append(Diagnosis(what, why, False, _ELSEWHERE))
+    return diagnoses
 
 
 def _system() -> Iterator[Diagnosis]:
@@ -69,13 +69,13 @@ def _system() -> Iterator[Diagnosis]:
     )
 
 
-def lines(found: Sequence[Diagnosis]) -> list[str]:
+def lines(diagnoses: Sequence[Diagnosis]) -> list[str]:
     """The report as lines of text."""
-    width, text = max(len(one.what) for one in found), []
-    for one in found:
-        text += hang(f"{'ok  ' if one.good else 'LACK'} {one.what:<{width}}  ", one.found)
-        if not one.good:
-            text += hang(f"     {'':<{width}}  -> ", one.advice)
+    width, text = max(len(diagnosis.what) for diagnosis in diagnoses), []
+    for diagnosis in diagnoses:
+        text += hang(f"{'ok  ' if diagnosis.good else 'LACK'} {diagnosis.what:<{width}}  ", diagnosis.found)
+        if not diagnosis.good:
+            text += hang(f"     {'':<{width}}  -> ", diagnosis.advice)
     return text
 
 
@@ -111,18 +111,18 @@ def _kernels() -> Diagnosis:
 
 
 def _disk(folder: Path) -> Diagnosis:
-    place = next(one for one in (folder.resolve(), *folder.resolve().parents) if one.exists())
+    place = next(parent for parent in (folder.resolve(), *folder.resolve().parents) if parent.exists())
     free, writable = shutil.disk_usage(place).free / 1e9, os.access(place, os.W_OK)
-    found = f"{free:.1f} GB free at {place}{'' if writable else ', not writable'}"
-    return Diagnosis("disk", found, writable and free >= _LEAST_FREE_GB, "choose another folder with -o")
+    text = f"{free:.1f} GB free at {place}{'' if writable else ', not writable'}"
+    return Diagnosis("disk", text, writable and free >= _LEAST_FREE_GB, "choose another folder with -o")
 
 
 def _cuda() -> Diagnosis:
-    here = gpu.probe()
-    if here is None:
+    device = gpu.probe()
+    if device is None:
         return Diagnosis("CUDA", "no GPU (not needed)")
-    capability = ".".join(map(str, here.capability))
-    found = f"{here.devices} GPU, driver {here.driver or 'unknown'}, compute capability {capability}"
-    why = gpu.obstacle(here)
+    capability = ".".join(map(str, device.capability))
+    text = f"{device.devices} GPU, driver {device.driver or 'unknown'}, compute capability {capability}"
+    why = gpu.obstacle(device)
     use = "" if why else "; render.variant=cuda_ad_rgb uses it"
-    return Diagnosis("CUDA", found + use, why is None, why or "")
+    return Diagnosis("CUDA", text + use, why is None, why or "")

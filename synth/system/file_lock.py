@@ -67,10 +67,10 @@ def is_held(path: Path) -> bool:
     return False
 
 
-def _try_lock(descriptor: int, how: int) -> bool | None:
+def _try_lock(descriptor: int, operation: int) -> bool | None:
     """Whether the lock was free and is now held; None where the file system has none."""
     try:
-        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, operation | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:

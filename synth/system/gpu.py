@@ -29,14 +29,14 @@ class Gpu:
 
 def visible() -> tuple[str, ...]:
     """Names of the GPUs in CUDA_VISIBLE_DEVICES, else of all that nvidia-smi lists."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is not None:
-        return tuple(name.strip() for name in named.split(",") if name.strip())
+    variable = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if variable is not None:
+        return tuple(name.strip() for name in variable.split(",") if name.strip())
     try:
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30).stdout
+        listing = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30).stdout
     except (OSError, subprocess.TimeoutExpired):  # no driver, or it does not respond
         return ()
-    return tuple(str(k) for k in range(len(re.findall("^GPU ", listed, re.MULTILINE))))
+    return tuple(str(k) for k in range(len(re.findall("^GPU ", listing, re.MULTILINE))))
 
 
 @functools.cache
@@ -76,6 +76,6 @@ def obstacle(gpu: Gpu | None) -> str | None:
 
 def _driver() -> str:
     with suppress(OSError):
-        found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", Path("/proc/driver/nvidia/version").read_text("utf-8"))
-        return found[0] if found else ""
+        match = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", Path("/proc/driver/nvidia/version").read_text("utf-8"))
+        return match[0] if match else ""
     return ""

@@ -23,8 +23,8 @@ LOOPS: list[tuple[Any, str]] = []
 """Loops and the types of their arguments, of the modules that are imported, see `argument_types`."""
 
 
-def compiled(function: F, **how: str) -> F:
-    """Compiles with numba and its options `how`, cached where numba does, else in `synth.system.cache`.
+def compiled(function: F, **options: str) -> F:
+    """Compiles with numba and its `options`, cached where numba does, else in `synth.system.cache`.
 
     `NUMBA_CACHE_DIR` is used only if it is this user's alone. numba detects changes only in the function's
     file: hence the rule of this package that a compiled function only calls compiled ones of its own file.
@@ -32,12 +32,12 @@ def compiled(function: F, **how: str) -> F:
     before = numba.config.CACHE_DIR
     with suppress(RuntimeError):  # no writable folder: a read-only installation without a home
         if not before or cache.is_private(Path(before)):
-            return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
+            return numba.njit(cache=True, nogil=True, **options)(function)  # type: ignore[no-any-return]
     try:
         numba.config.CACHE_DIR = str(cache.folder("loops"))
-        return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
+        return numba.njit(cache=True, nogil=True, **options)(function)  # type: ignore[no-any-return]
     except (RuntimeError, OSError):  # no temporary folder either, or a full disk
-        return numba.njit(nogil=True, **how)(function)  # type: ignore[no-any-return]
+        return numba.njit(nogil=True, **options)(function)  # type: ignore[no-any-return]
     finally:
         numba.config.CACHE_DIR = before
 
@@ -55,11 +55,11 @@ def inlined(function: F) -> F:
 def argument_types(types: str) -> Callable[[F], F]:
     """Decorates a compiled function that every dataset needs: `compile_loops` compiles it for these types."""
 
-    def note(function: F) -> F:
+    def register(function: F) -> F:
         LOOPS.append((function, types))
         return function
 
-    return note
+    return register
 
 
 def as_constant(array: Array) -> Array:

@@ -30,15 +30,15 @@ def find() -> str | None:
     Of `SULCUS_LLVM` (a parent process's result, empty for none), else `DRJIT_LIBLLVM_PATH`, else of the
     installed Python package, else the system's newest.
     """
-    given = os.environ.get("SULCUS_LLVM")
-    if given is not None:
-        return given or None
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    tried = [named] if named else [*packaged(), *candidates()]
-    return next((path for path in tried if probe(path)), None)
+    inherited = os.environ.get("SULCUS_LLVM")
+    if inherited is not None:
+        return inherited or None
+    override = os.environ.get("DRJIT_LIBLLVM_PATH")
+    paths = [override] if override else [*find_packaged(), *candidates()]
+    return next((path for path in paths if probe(path)), None)
 
 
-def packaged() -> list[str]:
+def find_packaged() -> list[str]:
     """The LLVM library that was installed with this program as a Python package, if it was."""
     try:
         files = metadata.files(_PACKAGE) or ()
@@ -50,14 +50,14 @@ def packaged() -> list[str]:
 
 def candidates() -> list[str]:
     """LLVM libraries of a usable version of this system, newest first."""
-    folders = [*(Path("/usr/lib", one) for one in _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
-    found: dict[Path, int] = {}
+    folders = [*(Path("/usr/lib", name) for name in _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
+    versions: dict[Path, int] = {}
     for path in [*_linker(), *(path for folder in folders for path in folder.glob("libLLVM*"))]:
-        named = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+))", path.name)
-        version = int(next(filter(None, named.groups()))) if named else 0
+        match = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+))", path.name)
+        version = int(next(filter(None, match.groups()))) if match else 0
         if version >= _OLDEST and path.exists():
-            found.setdefault(path.resolve(), version)
-    return [str(path) for path, _ in sorted(found.items(), key=lambda item: (-item[1], str(item[0])))]
+            versions.setdefault(path.resolve(), version)
+    return [str(path) for path, _ in sorted(versions.items(), key=lambda item: (-item[1], str(item[0])))]
 
 
 def probe(path: str) -> bool:
@@ -67,17 +67,17 @@ def probe(path: str) -> bool:
     """
     if not Path(path).exists():
         return False
-    about = Path(path).stat()
-    known = path, about.st_size, about.st_mtime_ns, packages.versions(), target_processor.target()
+    status = Path(path).stat()
+    key_parts = path, status.st_size, status.st_mtime_ns, packages.versions(), target_processor.target()
     note: Path | None = None
     with suppress(OSError):  # nowhere to note it
-        note = cache.folder("llvm") / f"works-{hashlib.sha256(repr(known).encode()).hexdigest()[:16]}"
+        note = cache.folder("llvm") / f"works-{hashlib.sha256(repr(key_parts).encode()).hexdigest()[:16]}"
         if note.exists():
             return True
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}
-    call = [sys.executable, "-c", _PROBE]
+    command = [sys.executable, "-c", _PROBE]
     try:
-        works = not subprocess.run(call, env=environment, capture_output=True, timeout=120).returncode
+        works = not subprocess.run(command, env=environment, capture_output=True, timeout=120).returncode
     except subprocess.TimeoutExpired:
         return False
     if works and note:
@@ -88,7 +88,7 @@ def probe(path: str) -> bool:
 
 def _linker() -> list[Path]:
     try:
-        cache = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=False).stdout
+        listing = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=False).stdout
     except FileNotFoundError:  # not a glibc system
         return []
-    return [Path(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)]
+    return [Path(path) for path in re.findall(r"=> (\S*libLLVM\S*)", listing)]

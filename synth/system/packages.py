@@ -22,13 +22,13 @@ def versions() -> dict[str, str]:
 
 @cache  # reading them takes 45 ms, and every sequence states them
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    by_package = {"python": platform.python_version()}
     for name in ("sulcus", "zarr", "torch", *COMPUTING):
         try:
-            found[name] = metadata.version(name)
+            by_package[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue  # optional, or run from a checkout that is not installed
-    return found
+    return by_package
 
 
 def machine() -> dict[str, str | int | float]:

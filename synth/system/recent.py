@@ -62,8 +62,8 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
         yield from _parts((rows.data, rows.indices, rows.indptr))
     elif isinstance(value, tuple | list):
         yield f"{len(value)} of".encode()
-        for each in value:
-            yield from _parts(each)
+        for item in value:
+            yield from _parts(item)
     elif is_dataclass(value):
         yield from _parts(tuple(getattr(value, field.name) for field in fields(value)))
     else:

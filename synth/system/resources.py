@@ -32,8 +32,8 @@ def memory(root: Path = _ROOT) -> int | None:
 def free_memory(root: Path = _ROOT) -> int | None:
     """Bytes that can still be used, cached files not counted as used; None on systems without /proc."""
     free = _meminfo("MemAvailable", root)
-    left = (limit - used for limit, used in _memory_groups(root))
-    return None if free is None else max(0, min([free, *left]))
+    remaining = (limit - used for limit, used in _memory_groups(root))
+    return None if free is None else max(0, min([free, *remaining]))
 
 
 def refuse_excess(needed: int) -> None:

@@ -26,7 +26,7 @@ def list_sources(source: Path) -> list[Path]:
     return folders if "*" in source.name and folders else [source]
 
 
-def inside(folder: Path, name: str) -> Path:
+def resolve_inside(folder: Path, name: str) -> Path:
     """The file that a series names in its folder. UserError: it is elsewhere, also by a link."""
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or "\0" in name:
@@ -41,18 +41,20 @@ def list_files(source: Path, force: str | None, instruments: str | None) -> list
 
     UserError: there are none.
     """
-    listed, tables = list[Path](), (table_of(force), instruments)
+    paths, tables = list[Path](), (table_of(force), instruments)
     for place in list_sources(source):
         folder = place if place.is_dir() else place.parent
-        named = folder.iterdir() if place.is_dir() else folder.glob(place.name)
-        files = [place] if place.is_file() else sorted(path for path in named if path.suffix in _OF_SERIES)
+        candidates = folder.iterdir() if place.is_dir() else folder.glob(place.name)
+        files = (
+            [place] if place.is_file() else sorted(path for path in candidates if path.suffix in _OF_SERIES)
+        )
         collections = [path for path in files if path.suffix in COLLECTIONS]
         if len(collections) == 1:  # which is then read instead of numbered files
             files += [file for file, _ in read_collection(collections[0])]
-        listed += [*files, *(inside(folder, name) for name in tables if name is not None)]
-    if not (present := [file for file in dict.fromkeys(listed) if file.is_file()]):
+        paths += [*files, *(resolve_inside(folder, name) for name in tables if name is not None)]
+    if not (existing := [file for file in dict.fromkeys(paths) if file.is_file()]):
         raise UserError(f"mechanics.source: no file is named by {source}")
-    return present
+    return existing
 
 
 def read_collection(source: Path) -> list[tuple[Path, float]]:
@@ -62,12 +64,12 @@ def read_collection(source: Path) -> list[tuple[Path, float]]:
         if "<!ENTITY" in text:
             raise ValueError("it declares entities")
         if source.suffix == ".pvd":
-            sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
-            if len({one.get("part", "0") for one in sets}) > 1:
+            sets = [entry.attrib for entry in ET.fromstring(text).iter("DataSet")]
+            if len({entry.get("part", "0") for entry in sets}) > 1:
                 raise ValueError("it has several parts at a time; choose one by a pattern")
-            found = [(one["file"], float(one["timestep"])) for one in sets]
+            states = [(entry["file"], float(entry["timestep"])) for entry in sets]
         else:
-            found = [(one["name"], float(one["time"])) for one in json.loads(text)["files"]]
-        if not 2 <= len(found) <= _MOST_STATES:
-            raise ValueError(f"it lists {len(found)} files, 2 to {_MOST_STATES} are possible")
-        return [(inside(source.parent, name), time) for name, time in found]
+            states = [(entry["name"], float(entry["time"])) for entry in json.loads(text)["files"]]
+        if not 2 <= len(states) <= _MOST_STATES:
+            raise ValueError(f"it lists {len(states)} files, 2 to {_MOST_STATES} are possible")
+        return [(resolve_inside(source.parent, name), time) for name, time in states]

@@ -37,7 +37,7 @@ class Stopwatch:
     def report(self) -> dict[str, dict[str, float] | float]:
         """`{stage: {"cpu_s", "wall_s"}, ..., "peak_rss_mb"}`, seconds and MB (1e6 bytes)."""
         peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        found: dict[str, dict[str, float] | float] = {"peak_rss_mb": round(peak_kib * 1024 / 1e6, 1)}
+        times: dict[str, dict[str, float] | float] = {"peak_rss_mb": round(peak_kib * 1024 / 1e6, 1)}
         for name, (cpu, wall) in self._spent_s.items():
-            found[name] = {"cpu_s": round(cpu, 3), "wall_s": round(wall, 3)}
-        return found
+            times[name] = {"cpu_s": round(cpu, 3), "wall_s": round(wall, 3)}
+        return times

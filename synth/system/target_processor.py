@@ -14,8 +14,8 @@ _FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # of it, b
 def has_common() -> bool:
     """Whether this processor runs what is compiled for `COMMON`."""
     with suppress(RuntimeError):  # LLVM doesn't know this processor
-        has = binding.get_host_cpu_features()
-        return all(has.get(name) for name in _FEATURES)
+        features = binding.get_host_cpu_features()
+        return all(features.get(name) for name in _FEATURES)
     return False
 
 
@@ -25,5 +25,5 @@ def target() -> str:
     It is x86-64-v3 where that runs, so that such machines compute the same bits and can share a cache; as
     fast as the host's own name here. `NUMBA_CPU_NAME` overrides it.
     """
-    stated = os.environ.get("NUMBA_CPU_NAME")
-    return stated or (COMMON if has_common() else str(binding.get_host_cpu_name()))
+    override = os.environ.get("NUMBA_CPU_NAME")
+    return override or (COMMON if has_common() else str(binding.get_host_cpu_name()))

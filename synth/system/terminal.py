@@ -22,12 +22,12 @@ ProgressCallback = Callable[[int, int], None]  # called with the number done and
 class ProgressBars(progress.Progress):
     """Progress bars on stderr if they can be animated: in a terminal, or in a notebook with ipywidgets."""
 
-    def __init__(self, *further: progress.ProgressColumn, transient: bool = False) -> None:
+    def __init__(self, *extra_columns: progress.ProgressColumn, transient: bool = False) -> None:
         console = Console(stderr=True)
-        drawn = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+        animated = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
         text, counts = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
-        columns = (text, progress.BarColumn(), counts, *further)
-        super().__init__(*columns, console=console, transient=transient, disable=not drawn)
+        columns = (text, progress.BarColumn(), counts, *extra_columns)
+        super().__init__(*columns, console=console, transient=transient, disable=not animated)
 
 
 @contextmanager
@@ -64,11 +64,11 @@ def hang(head: str, text: str) -> list[str]:
 
 def clock(seconds: float) -> str:
     """9 s, 2:05 min, 3:20 h, 4.2 days."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    if whole < 86400:
-        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    rounded_s = round(seconds)
+    if rounded_s < 60:
+        return f"{rounded_s} s"
+    if rounded_s < 3600:
+        return f"{rounded_s // 60}:{rounded_s % 60:02d} min"
+    if rounded_s < 86400:
+        return f"{rounded_s // 3600}:{rounded_s % 3600 // 60:02d} h"
     return f"{seconds / 86400:.1f} days"

@@ -65,8 +65,8 @@ class Probe:
             recovered = self._error(scene, track.flow[1:])
         rendering_s, flow_s = watch.cpu_s("rendering") / len(frames), watch.cpu_s("flow") / (1 + len(frames))
         sequence_s = watch.cpu_s("physics"), watch.cpu_s("scene") - rendering_s
-        stages = [*(spent / job.frames for spent in sequence_s), rendering_s, flow_s]
-        return [label, recovered, *(max(1e-6, spent) for spent in stages)]
+        stages = [*(seconds / job.frames for seconds in sequence_s), rendering_s, flow_s]
+        return [label, recovered, *(max(1e-6, seconds) for seconds in stages)]
 
     def _error(self, scene: Scene, flows: Iterable[Map]) -> float:
         """Root mean square over frames, instruments together."""
@@ -86,12 +86,16 @@ def linearise(scene: Scene, frames: list[Frame]) -> Floats:
     force /= max(np.sqrt(np.square(force).sum(axis=1).mean()), 1e-9)
     true_mm = np.stack([cells_mm(scene, frame.flow) for frame in frames])
     responses = np.zeros((*force.shape, true_mm[0].size))
-    own = [trajectory(gesture, scene.job.frames) for gesture in scene.scenario.gestures]
-    for i, stronger in enumerate(own):
-        weaker = [*own[:i], replace(stronger, load=(1 - _LESS) * stronger.load), *own[i + 1 :]]
-        moved = simulate(scene.dataset, case=scene.scenario, motions=weaker).motion.displacement
+    trajectories = [trajectory(gesture, scene.job.frames) for gesture in scene.scenario.gestures]
+    for i, stronger in enumerate(trajectories):
+        weaker = [
+            *trajectories[:i],
+            replace(stronger, load=(1 - _LESS) * stronger.load),
+            *trajectories[i + 1 :],
+        ]
+        displacement = simulate(scene.dataset, case=scene.scenario, motions=weaker).motion.displacement
         for k in np.flatnonzero(force[:, i] >= _FAINT):
-            states = (rest + state[numbers[k]] for state in (scene.motion.displacement, moved))
+            states = (rest + state[numbers[k]] for state in (scene.motion.displacement, displacement))
             pixels = np.subtract(*(camera.project(scene.view, state) for state in states))
             flow = truth.at_rest_pixels(scene.renderer.rest, scene.surface.faces, pixels)
             responses[k, i] = cells_mm(scene, flow).ravel() / (_LESS * force[k, i])

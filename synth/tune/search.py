@@ -59,11 +59,11 @@ class Measurements:
 
     def __init__(self, job: Job) -> None:
         self.job, self.grid = job, list_settings(job)
-        explicit = changed(job, {"fem.law": own_law(job)})
-        self.own: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
+        explicit = change_job(job, {"fem.law": own_law(job)})
+        self.original: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
         self.full: Settings = {key: settings[0] for key, settings in self.grid.items()}
-        here = packages.machine(), adapter.pick(job.render.variant)  # costs are of this machine
-        self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()} {here}"
+        machine = packages.machine(), adapter.pick(job.render.variant)  # costs are of this machine
+        self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()} {machine}"
         self._probes: dict[int, tuple[Job, Probe]] = {}
 
     def evaluate(self, settings: Settings, sequences: Sequence[int]) -> Evaluation:
@@ -81,25 +81,29 @@ class Measurements:
         """As `Probe.measure`; all infinite if the settings cannot be carried out."""
 
         def make() -> list[float]:
-            (job, probe), found = self._probe(sequence), [np.inf] * 6
+            (job, probe), results = self._probe(sequence), [np.inf] * 6
             with suppress(*[UserError] * (settings != self.full)):
-                found = probe.measure(changed(job, settings))
-            print(f"sequence {sequence}: {show(settings, self.own)}", file=sys.stderr, flush=True)
-            return found
+                results = probe.measure(change_job(job, settings))
+            print(f"sequence {sequence}: {show(settings, self.original)}", file=sys.stderr, flush=True)
+            return results
 
         key = f"{self._made_by} {sequence} {sorted(settings.items())}".encode()
-        dump, load = (lambda found: json.dumps(found).encode()), json.loads
-        return cache.cached("tune/json", key, make, dump, load, (ValueError,), _STORED)
+        dump, load = (lambda results: json.dumps(results).encode()), json.loads
+        return cache.load_or_make("tune/json", key, make, dump, load, (ValueError,), _STORED)
 
     def _probe(self, sequence: int) -> tuple[Job, Probe]:
         """A sequence's job and probe; draws that full fidelity cannot carry out are passed over."""
         kinds, families = self.job.fem.gestures, self.job.appearance.families
-        here: dict[str, Any] = {"sequences": 1, "fem.gestures": [kinds[sequence % len(kinds)]], **self.full}
-        here["appearance.families"] = [families[sequence % len(families)]]  # in turn
+        changes: dict[str, Any] = {
+            "sequences": 1,
+            "fem.gestures": [kinds[sequence % len(kinds)]],
+            **self.full,
+        }
+        changes["appearance.families"] = [families[sequence % len(families)]]  # in turn
         for attempt in range(_DRAWS):
             if sequence not in self._probes:
-                here["seed"] = crc32(f"tune {self.job.seed} {sequence} {attempt}".encode())
-                job = changed(self.job, here)
+                changes["seed"] = crc32(f"tune {self.job.seed} {sequence} {attempt}".encode())
+                job = change_job(self.job, changes)
                 with suppress(*[UserError] * (attempt < _DRAWS - 1)):
                     self._probes[sequence] = job, Probe(job)
         return self._probes[sequence]
@@ -111,17 +115,17 @@ class Tuned:
 
     budget: float
     full: Evaluation
-    own: Evaluation  # the job as given
+    original: Evaluation  # the job as given
     best: Evaluation
     rows: tuple[Evaluation, ...]  # each change by itself, on the probes, then whole jobs
 
 
 def parse_budget(text: str) -> float:
     """0.03 of `force 3%`: by how much the force error may grow. UserError for anything else."""
-    found = re.fullmatch(r"\s*force\s+(\d+(?:\.\d+)?)\s*%\s*", text)
-    if not found or not 0 < float(found[1]) < 100:
+    match = re.fullmatch(r"\s*force\s+(\d+(?:\.\d+)?)\s*%\s*", text)
+    if not match or not 0 < float(match[1]) < 100:
         raise UserError(f"--budget {text!r}: is written as 'force 3%', more than 0 and less than 100")
-    return float(found[1]) / 100
+    return float(match[1]) / 100
 
 
 def tune(measurements: Measurements, budget: float, probes: int, checks: int) -> Tuned:
@@ -130,32 +134,39 @@ def tune(measurements: Measurements, budget: float, probes: int, checks: int) ->
     Every setting is measured on `probes` sequences, whole jobs on `checks` more. The answer never costs more
     than the job, unless that misses the budget by more than its margin. UserError: full fidelity fails.
     """
-    grid, some, every = measurements.grid, range(probes), range(probes + checks)
-    full = measurements.evaluate(measurements.full, every)
-    own = measurements.evaluate(measurements.own, every)
-    start = own if np.isfinite(own.growth) and own.growth - own.margin <= budget else full
-    changes = [(key, one) for key in grid for one in grid[key] if one != start.settings[key]]
-    alone = {(key, one): measurements.evaluate({**start.settings, key: one}, some) for key, one in changes}
-    base, candidates = measurements.evaluate(start.settings, some), []
+    grid, probe_indices, all_indices = measurements.grid, range(probes), range(probes + checks)
+    full = measurements.evaluate(measurements.full, all_indices)
+    original = measurements.evaluate(measurements.original, all_indices)
+    start = original if np.isfinite(original.growth) and original.growth - original.margin <= budget else full
+    changes = [(key, value) for key in grid for value in grid[key] if value != start.settings[key]]
+    single_changes = {
+        (key, value): measurements.evaluate({**start.settings, key: value}, probe_indices)
+        for key, value in changes
+    }
+    base, candidates = measurements.evaluate(start.settings, probe_indices), []
     for values in itertools.product(*grid.values()):
         settings = dict(zip(grid, values, strict=True))
-        parts = [alone[change] for change in settings.items() if change in alone]
-        growth = base.growth + sum(one.growth - base.growth for one in parts)
-        cost = np.prod([base.stages, *(one.stages / base.stages for one in parts)], axis=0).sum()
+        parts = [single_changes[change] for change in settings.items() if change in single_changes]
+        growth = base.growth + sum(evaluation.growth - base.growth for evaluation in parts)
+        cost = np.prod(
+            [base.stages, *(evaluation.stages / base.stages for evaluation in parts)], axis=0
+        ).sum()
         if growth <= budget and cost < _CHEAPER * base.stages.sum():
-            order = round(np.log(cost) / np.log(_CHEAPER)), -len(differences(settings, own.settings))
+            order = round(np.log(cost) / np.log(_CHEAPER)), -len(differences(settings, original.settings))
             candidates.append((order, growth, settings))
-    best, tried, allowed = start, list[Evaluation](), budget
-    for _, growth, settings in sorted(candidates, key=lambda one: one[0], reverse=True):
-        if growth <= allowed and best is start and len(tried) < _TRIES:
-            found = measurements.evaluate(settings, every)
-            tried.append(found)
-            if found.growth > budget:
+    best, trials, allowed = start, list[Evaluation](), budget
+    for _, growth, settings in sorted(candidates, key=lambda candidate: candidate[0], reverse=True):
+        if growth <= allowed and best is start and len(trials) < _TRIES:
+            evaluation = measurements.evaluate(settings, all_indices)
+            trials.append(evaluation)
+            if evaluation.growth > budget:
                 allowed = base.growth + _CAREFUL * (growth - base.growth)
-            elif found.stages.sum() < _CHEAPER * start.stages.sum():
-                best = found
-    single = [one for one in alone.values() if one.settings != own.settings]
-    return Tuned(budget, full, own, best, (*single, full, own, *tried))
+            elif evaluation.stages.sum() < _CHEAPER * start.stages.sum():
+                best = evaluation
+    measured = [
+        evaluation for evaluation in single_changes.values() if evaluation.settings != original.settings
+    ]
+    return Tuned(budget, full, original, best, (*measured, full, original, *trials))
 
 
 def own_law(job: Job) -> str:
@@ -187,7 +198,7 @@ def list_settings(job: Job) -> dict[str, list[Any]]:
     return {key: settings for key, settings in grid.items() if len(settings) > 1}
 
 
-def changed(job: Job, changes: Mapping[str, Any]) -> Job:
+def change_job(job: Job, changes: Mapping[str, Any]) -> Job:
     """The job with the values of dotted keys changed. UserError where they don't go together."""
     return override(job, [f"{key}={json.dumps(value)}" for key, value in changes.items()])
 
@@ -199,13 +210,13 @@ def differences(settings: Settings, start: Settings) -> Settings:
 
 def show(settings: Settings, start: Settings) -> str:
     """The same in words."""
-    words = ", ".join(f"{key} {one}" for key, one in differences(settings, start).items())
+    words = ", ".join(f"{key} {value}" for key, value in differences(settings, start).items())
     return words or "the job as given"
 
 
 def lines(tuned: Tuned) -> list[str]:
     """The budget, then a line for every setting by itself and for whole jobs."""
-    found = [
+    rows = [
         f"Written by synth tune: the force error may grow by {100 * tuned.budget:g}% of the force over full",
         "fidelity's. Each change by itself, then whole jobs; ± is a 95% interval over sequences.",
         "",
@@ -217,9 +228,9 @@ def lines(tuned: Tuned) -> list[str]:
         figures += f"{row.stages.sum():16.3g}"
         if not np.isfinite(row.growth):
             figures = f"{'cannot be carried out':>46s}"
-        words = "full fidelity" if row is tuned.full else show(row.settings, tuned.own.settings)
-        found.append(f"{figures}   {words}{'  <- this job' if row is tuned.best else ''}")
-    return found
+        words = "full fidelity" if row is tuned.full else show(row.settings, tuned.original.settings)
+        rows.append(f"{figures}   {words}{'  <- this job' if row is tuned.best else ''}")
+    return rows
 
 
 def write_job(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) -> None:
@@ -233,7 +244,7 @@ def write_job(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) ->
         keys = {key: path for key, path in paths.items() if path is not None}
         if identity.find_meshes(job):
             keys |= {f"fem.{name}": job["fem"][name] for name in ("instrument", "instrument_list")}
-    changes = differences(tuned.best.settings, tuned.own.settings)
+    changes = differences(tuned.best.settings, tuned.original.settings)
     config.change(f"{key}={json.dumps(value)}" for key, value in (keys | dict(changes)).items())
     head = "".join(f"# {line}".rstrip() + "\n" for line in lines(tuned))
     with out.open("x", encoding="utf-8") as file:

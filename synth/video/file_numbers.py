@@ -40,10 +40,10 @@ def number_files(paths: Collection[Path]) -> dict[int, Path]:
     ordered = sorted(paths, key=natural_order)
     series = Counter(re.sub("[0-9]+", "*", path.name) for path in ordered).most_common(3)
     if len(series) > 1 and any("*" in name for name, _ in series):
-        some = ", ".join(f"{count} {name}" for name, count in series)
-        raise UserError(_SEVERAL.format(ordered[0].parent, some, series[0][0]))
-    found = [[int(part) for part in re.findall("[0-9]+", path.stem)[::-1]] for path in ordered]
-    columns = [*zip(*found, strict=False)]  # only as many as every name has
+        series_text = ", ".join(f"{count} {name}" for name, count in series)
+        raise UserError(_SEVERAL.format(ordered[0].parent, series_text, series[0][0]))
+    number_lists = [[int(part) for part in re.findall("[0-9]+", path.stem)[::-1]] for path in ordered]
+    columns = [*zip(*number_lists, strict=False)]  # only as many as every name has
     for numbers in columns:
         rising = all(a < b for a, b in pairwise(numbers))
         if rising and numbers[-1] - numbers[0] <= _SPARSE * len(numbers) + _SPARE:
@@ -89,8 +89,8 @@ def find_stamps(paths: Collection[Path]) -> Floats | None:
     least, most = _SINCE_1970_S
     for per_second in (1, 1000, 10**6, 10**9):
         if all(least * per_second < number < most * per_second for number in last):
-            whole = np.array([number // per_second for number in last], np.float64)
-            return whole + np.array([number % per_second for number in last], np.float64) / per_second
+            seconds = np.array([number // per_second for number in last], np.float64)
+            return seconds + np.array([number % per_second for number in last], np.float64) / per_second
     return None
 
 
@@ -103,25 +103,30 @@ def match_numbers(
     `frames`: of the video, empty if unknown; `notes` receives a line if as many numbers, equally spaced,
     differ. UserError: some are not frames, and neither the first nor the last ones agree.
     """
-    own, video = np.unique(list(numbers)), np.unique(list(frames))
-    same = dict(zip(own.tolist(), own.tolist(), strict=True))
-    if not len(own) or not len(video) or np.isin(own, video).all():
+    indices, video = np.unique(list(numbers)), np.unique(list(frames))
+    same = dict(zip(indices.tolist(), indices.tolist(), strict=True))
+    if not len(indices) or not len(video) or np.isin(indices, video).all():
         return same
-    across, along = own - own[0], video - video[0]
-    if len(own) == len(video) and (across * along[-1] == along * across[-1]).all():
+    index_offsets, video_offsets = indices - indices[0], video - video[0]
+    if (
+        len(indices) == len(video)
+        and (index_offsets * video_offsets[-1] == video_offsets * index_offsets[-1]).all()
+    ):
         notes.append(
-            f"{name} has numbers {own[0]} to {own[-1]}, the video {video[0]} to {video[-1]}: matched in order"
+            f"{name} has numbers {indices[0]} to {indices[-1]}, the video {video[0]} to {video[-1]}: "
+            "matched in order"
         )
-        return dict(zip(own.tolist(), video.tolist(), strict=True))
+        return dict(zip(indices.tolist(), video.tolist(), strict=True))
     # If the numbers exceed the video at one end only, frames are missing there or the video is truncated. But
     # if one begins at 0 and the other at 1, they may be counted differently.
-    recounted = own[0] == 0 and video[0] == 1
-    inside = own[0] > video[0] and own[-1] < video[-1]
-    if own[0] == video[0] or inside or (own[-1] == video[-1] and not recounted):
+    recounted = indices[0] == 0 and video[0] == 1
+    inside = indices[0] > video[0] and indices[-1] < video[-1]
+    if indices[0] == video[0] or inside or (indices[-1] == video[-1] and not recounted):
         return same
     raise UserError(
-        f"{name} has numbers {own[0]} to {own[-1]} ({len(own)}), the video frames {video[0]} to {video[-1]} "
-        f"({len(video)}): they can't be matched; give files and frames of one moment the same number"
+        f"{name} has numbers {indices[0]} to {indices[-1]} ({len(indices)}), the video frames "
+        f"{video[0]} to {video[-1]} ({len(video)}): they can't be matched; "
+        "give files and frames of one moment the same number"
     )
 
 
@@ -130,6 +135,6 @@ def describe_gaps(numbers: Sequence[int], name: str) -> list[str]:
     steps = np.diff(np.array(numbers, np.int64))
     if not len(steps) or (steps == steps[0]).all():
         return []
-    lost = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
-    some = ", ".join(map(str, lost[:5])) + (", ..." if len(lost) > 5 else "")
-    return [f"{name} lacks {len(lost)} of the numbers {numbers[0]} to {numbers[-1]} ({some}): gaps"]
+    missing = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
+    examples = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+    return [f"{name} lacks {len(missing)} of the numbers {numbers[0]} to {numbers[-1]} ({examples}): gaps"]

@@ -69,15 +69,15 @@ def read_video(path: Path | VideoFile, fps: float | None = None) -> Iterator[Pic
     are `damaged` up to the next that is coded without others. UserError: not a video, no video stream,
     several without a choice, or pictures larger than 40 megapixels.
     """
-    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
-    path = chosen.path
+    video = path if isinstance(path, VideoFile) else VideoFile(path)
+    path = video.path
     with _open_video(path) as container:
-        stream = _film(container, chosen)
+        stream = _find_film(container, video)
         # Two cores at most: a bench machine scores several recordings at a time.
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = 2
         has_times, index = container.format.name != "avi", 0
-        start_s = (container.start_time or 0) / av.time_base if has_times and chosen.from_file else None
+        start_s = (container.start_time or 0) / av.time_base if has_times and video.from_file else None
         damaged = False
         try:
             for frame, ticks, broken in _decode(container, stream):
@@ -86,12 +86,12 @@ def read_video(path: Path | VideoFile, fps: float | None = None) -> Iterator[Pic
                 rgb = frame.to_ndarray(format="rgb24")
                 if width != frame.width:
                     rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_AREA))
-                stated = None if ticks is None else float(ticks * frame.time_base)
-                start_s = stated if start_s is None and stated is not None else start_s
-                unstated = None if fps is None else index / fps
-                time_s = unstated if stated is None or start_s is None else stated - start_s
+                stated_s = None if ticks is None else float(ticks * frame.time_base)
+                start_s = stated_s if start_s is None and stated_s is not None else start_s
+                computed_s = None if fps is None else index / fps
+                time_s = computed_s if stated_s is None or start_s is None else stated_s - start_s
                 damaged = broken or frame.is_corrupt or (damaged and not frame.key_frame)
-                yield Picture(index, time_s, np.ascontiguousarray(_upright(rgb, frame)), damaged)
+                yield Picture(index, time_s, np.ascontiguousarray(_turn_upright(rgb, frame)), damaged)
                 index += 1
         except (av.error.FFmpegError, ValueError) as error:
             if index == 0:
@@ -125,8 +125,8 @@ def _decode(
 def find_start(path: Path | VideoFile) -> float:
     """Time of a video's first picture from the start of its file [s], which sound or undecodable pictures may
     begin; 0 if its format has no times. UserError: it is no video."""
-    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
-    first = next(read_video(replace(chosen, from_file=True)))
+    video = path if isinstance(path, VideoFile) else VideoFile(path)
+    first = next(read_video(replace(video, from_file=True)))
     return first.time_s or 0.0
 
 
@@ -148,43 +148,45 @@ def _seconds_since_1970(text: str) -> float | None:
 
 def find_length(path: Path | VideoFile) -> float:
     """Length that a video states for its film [s]; 0 if none. UserError: it is no video."""
-    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
-    with _open_video(chosen.path) as container:
-        stream = _film(container, chosen)
+    video = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(video.path) as container:
+        stream = _find_film(container, video)
         return float(stream.duration * stream.time_base) if stream.duration else 0.0
 
 
-def _film(container: InputContainer, chosen: VideoFile) -> av.VideoStream:
+def _find_film(container: InputContainer, video: VideoFile) -> av.VideoStream:
     """The film of a video. UserError: there is none, or several and none is chosen."""
     if not container.streams.video:
-        raise UserError(f"{chosen.path}: holds no video stream")
-    films = _films(container, chosen.path)
-    number = 0 if chosen.stream is None and len(films) == 1 else chosen.stream
+        raise UserError(f"{video.path}: holds no video stream")
+    films = _list_films(container, video.path)
+    number = 0 if video.stream is None and len(films) == 1 else video.stream
     if number is None or not 0 <= number < len(films):
-        streams = ", ".join(f"{k}: {one.width} x {one.height}" for k, one in enumerate(films))
+        streams = ", ".join(f"{k}: {film.width} x {film.height}" for k, film in enumerate(films))
         raise UserError(
-            f"{chosen.path}: holds {len(films)} films ({streams}): choose one by stream: in meta.yaml or "
+            f"{video.path}: holds {len(films)} films ({streams}): choose one by stream: in meta.yaml or "
             "bench import --use stream=NUMBER"
         )
     return films[number]
 
 
-def _films(container: InputContainer, path: Path) -> list[av.VideoStream]:
+def _list_films(container: InputContainer, path: Path) -> list[av.VideoStream]:
     """The video streams that are no covers: pictures attached, or single ones next to a film."""
-    streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+    streams = [
+        stream for stream in container.streams.video if not stream.disposition & Disposition.attached_pic
+    ]
     if len(streams) < 2:
         return streams or [*container.streams.video]
-    counts = dict.fromkeys((one.index for one in streams), 0)
-    with _open_video(path) as again:
-        for packet in islice(again.demux(*again.streams.video), _PEEKED):
+    counts = dict.fromkeys((stream.index for stream in streams), 0)
+    with _open_video(path) as reopened:
+        for packet in islice(reopened.demux(*reopened.streams.video), _PEEKED):
             if packet.size and packet.stream.index in counts:
                 counts[packet.stream.index] += 1
                 if min(counts.values()) > 1:
                     break
-    return [one for one in streams if counts[one.index] > 1] or streams[:1]
+    return [stream for stream in streams if counts[stream.index] > 1] or streams[:1]
 
 
-def _upright(rgb: Pixels, frame: av.VideoFrame) -> Pixels:
+def _turn_upright(rgb: Pixels, frame: av.VideoFrame) -> Pixels:
     """The picture (H, W, 3) as by the frame's display matrix, which turns and mirrors."""
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
@@ -208,37 +210,37 @@ def read_frames(path: Path, fps: float) -> Iterator[Picture]:
         return read_video(path, fps)
     stills = number_files(find_stills(path))
     times = still_times(stills, fps, [])
-    return (replace(one, time_s=times[one.index]) for one in read_pictures(stills))
+    return (replace(picture, time_s=times[picture.index]) for picture in read_pictures(stills))
 
 
 def count_frames(path: Path | VideoFile) -> int | None:
     """Number of frames stated by the container, else counted; None: no video stream. May raise UserError."""
-    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
-    with _open_video(chosen.path) as container:
+    video = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(video.path) as container:
         if not container.streams.video:
             return None
-        stream = _film(container, chosen)
-        stated = stream.frames
+        stream = _find_film(container, video)
+        count = stream.frames
         with suppress(av.error.FFmpegError):  # those before a cut
-            if not stated:
+            if not count:
                 for packet in container.demux(stream):
-                    stated += packet.size > 0
-        return stated or None
+                    count += packet.size > 0
+        return count or None
 
 
 def pixel_aspect(path: Path | VideoFile) -> float:
     """Width over height of a video's pixels, 1 if not stated. UserError if it is not a video."""
-    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
-    with _open_video(chosen.path) as container:
+    video = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(video.path) as container:
         if not container.streams.video:
             return 1.0
-        return _square_width(1 << 20, _film(container, chosen).sample_aspect_ratio) / (1 << 20)
+        return _square_width(1 << 20, _find_film(container, video).sample_aspect_ratio) / (1 << 20)
 
 
 def _square_width(width: int, aspect: Fraction | None) -> int:
     """Width in square pixels of a picture with `width` pixels of that aspect ratio."""
-    stated = float(aspect) if aspect else 1.0
-    return round(width * stated) if 1 / _WIDEST <= stated <= _WIDEST else width
+    ratio = float(aspect) if aspect else 1.0
+    return round(width * ratio) if 1 / _WIDEST <= ratio <= _WIDEST else width
 
 
 def _open_video(path: Path) -> InputContainer:
@@ -279,15 +281,15 @@ def _refuse_other(path: Path) -> None:
 
 def _has_index(file: BufferedReader) -> bool:
     """Whether an MP4's boxes, of [ISO 14496-12, 4.2], include moov."""
-    size, at = os.fstat(file.fileno()).st_size, 0
-    while at + 8 <= size:
-        file.seek(at)
+    size, position = os.fstat(file.fileno()).st_size, 0
+    while position + 8 <= size:
+        file.seek(position)
         length, name = struct.unpack(">I4s", file.read(8))
         if name == b"moov":
             return True
         if length == 1:
             length = struct.unpack(">Q", file.read(8).rjust(8, b"\0"))[0]
-        at += length if length >= 8 else size
+        position += length if length >= 8 else size
     return False
 
 
@@ -333,20 +335,20 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     picture = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
     levels = np.atleast_3d(picture)
     if levels.shape[2] == 4:
-        colour, opaque = levels[..., :3], levels[..., 3]
-        drawn = colour[opaque > 0]
-        plain = np.ptp(opaque) > 0 and (drawn == drawn[:1]).all()
-        levels = opaque[..., None] if plain else colour * (opaque > 0)[..., None]
+        colour, opacity = levels[..., :3], levels[..., 3]
+        colours = colour[opacity > 0]
+        single_colour = np.ptp(opacity) > 0 and (colours == colours[:1]).all()
+        levels = opacity[..., None] if single_colour else colour * (opacity > 0)[..., None]
     brightest = levels.max(axis=2)
-    few = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
-    mask = brightest > (0 if few else brightest.max() / 2)
+    is_labels = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
+    mask = brightest > (0 if is_labels else brightest.max() / 2)
     _refuse_other_size(path, mask.shape, size, "the video is")
     return np.asarray(mask, bool)
 
 
-def _refuse_other_size(path: Path, found: tuple[int, ...], size: tuple[int, ...], what: str) -> None:
-    if found != size:
-        raise UserError(f"{path}: is {found[1]} x {found[0]}, but {what} {size[1]} x {size[0]}")
+def _refuse_other_size(path: Path, shape: tuple[int, ...], size: tuple[int, ...], other: str) -> None:
+    if shape != size:
+        raise UserError(f"{path}: is {shape[1]} x {shape[0]}, but {other} {size[1]} x {size[0]}")
 
 
 def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
@@ -355,8 +357,8 @@ def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
         return picture
     size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))
     # Cropped to a multiple, so that a pixel of the small picture is shrink x shrink pixels of the large one.
-    cut = picture[: size[1] * shrink, : size[0] * shrink]
-    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
+    cropped = picture[: size[1] * shrink, : size[0] * shrink]
+    return np.asarray(cv2.resize(cropped, size, interpolation=cv2.INTER_AREA), picture.dtype)
 
 
 def shrink_mask(mask: Mask, shrink: int, above: int) -> Mask:

@@ -39,20 +39,23 @@ _AGAIN, _ASIDE = 0.6, 1.0  # in turn: largest change to the next but one over th
 
 def find_layout(pictures: Sequence[Pixels]) -> str:
     """The layout, one of `LAYOUTS`, of a video with these first pictures (H, W, 3); empty: one camera."""
-    stored = (cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY) for rgb in pictures)
-    grey = [one.astype(np.float32) for one in stored]
+    grey_8bit = (cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY) for rgb in pictures)
+    grey = [picture.astype(np.float32) for picture in grey_8bit]
     height, width = grey[0].shape
-    for axis, whole, squeezed in ((1, "side-by-side", "half-width"), (0, "top-bottom", "half-height")):
-        half, (share, _) = grey[0].shape[axis] // 2, match(*split(grey[0], whole))
+    for axis, layout, squeezed_layout in (
+        (1, "side-by-side", "half-width"),
+        (0, "top-bottom", "half-height"),
+    ):
+        half, (share, _) = grey[0].shape[axis] // 2, match(*split(grey[0], layout))
         if share > _SHARE:
             lines = np.moveaxis(grey[0], axis, 0)
             steps = np.abs(lines[3:] - lines[:-3]).mean(axis=1)[max(half - 12, 0) : half + 10]
             goes_on = _DARK < np.median(steps) > np.median(steps[9:11]) / _STEP
             if share > _CERTAIN or not goes_on:
-                return squeezed if (width < 2 * height if axis else width > height) else whole
-    fine = [one - cv2.GaussianBlur(one, (0, 0), 3) for one in grey]
-    changes = [[np.abs(a - b).mean() for a, b in zip(fine, fine[k:], strict=False)] for k in (1, 2)]
-    if len(fine) >= 5 and np.median(changes[1]) <= _AGAIN * np.median(changes[0]):
+                return squeezed_layout if (width < 2 * height if axis else width > height) else layout
+    details = [picture - cv2.GaussianBlur(picture, (0, 0), 3) for picture in grey]
+    changes = [[np.abs(a - b).mean() for a, b in zip(details, details[k:], strict=False)] for k in (1, 2)]
+    if len(details) >= 5 and np.median(changes[1]) <= _AGAIN * np.median(changes[0]):
         share, aside = match(grey[0], grey[1], 2 * _COLUMNS)
         if share > _SHARE and aside >= _ASIDE:
             return "alternating"
@@ -65,35 +68,35 @@ def _find_mixed(pictures: Sequence[Pixels]) -> str:
     Of the four pictures of every second pixel, two pairs are then of one camera each. Two fields of an
     interlaced video differ likewise where the picture moves, but by half as much as from picture to picture.
     """
-    layout, later = _mixed_layout(pictures[0]), {len(pictures) // 2, len(pictures) - 1} - {0}
-    if not layout or any(_mixed_layout(pictures[k]) != layout for k in later):
+    layout, later_indices = _detect_mixed(pictures[0]), {len(pictures) // 2, len(pictures) - 1} - {0}
+    if not layout or any(_detect_mixed(pictures[k]) != layout for k in later_indices):
         return ""
     if layout == "rows" and len(pictures) > 1:
         fields = [[_smooth(rgb[k::2, ::2, 1]) for k in (0, 1)] for rgb in pictures[:3]]
-        apart = [_shift(even, odd)[1] for even, odd in fields]
-        moved = [_shift(a[0], b[0])[1] for a, b in itertools.pairwise(fields)]
-        if max(moved) > _FIELDS * min(apart):
+        field_shifts = [_shift(even, odd)[1] for even, odd in fields]
+        frame_shifts = [_shift(a[0], b[0])[1] for a, b in itertools.pairwise(fields)]
+        if max(frame_shifts) > _FIELDS * min(field_shifts):
             return ""
     return layout
 
 
-def _mixed_layout(rgb: Pixels) -> str:
+def _detect_mixed(rgb: Pixels) -> str:
     height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
-    green = rgb[:height, :width, 1]
-    first, right, below, across = (_smooth(green[k::2, j::2]) for k in (0, 1) for j in (0, 1))
-    apart = [_differ(first, right), _differ(first, below)]
-    if any(apart):  # else it is none of these
-        apart.append(_differ(first, across))
+    channel = rgb[:height, :width, 1]
+    first, right, below, across = (_smooth(channel[k::2, j::2]) for k in (0, 1) for j in (0, 1))
+    differences = [_differ(first, right), _differ(first, below)]
+    if any(differences):  # else it is none of these
+        differences.append(_differ(first, across))
     for name, pattern in (("rows", [0, 1, 1]), ("columns", [1, 0, 1]), ("checkerboard", [1, 1, 0])):
-        if apart == pattern:
-            return name if _finest_power(green, _FINEST[name]) > _REPLICA else ""
-    red, same, blue = (_smooth(rgb[..., k], 4.0) for k in range(3))
-    by_colour = _differ(red, same) and _differ(red, blue) and not _differ(same, blue)
+        if differences == pattern:
+            return name if _finest_power(channel, _FINEST[name]) > _REPLICA else ""
+    red, green, blue = (_smooth(rgb[..., k], 4.0) for k in range(3))
+    by_colour = _differ(red, green) and _differ(red, blue) and not _differ(green, blue)
     return "anaglyph" if by_colour else ""
 
 
-def _differ(one: Array, other: Array) -> bool:
-    return bool(np.all(_shift(one, other) >= _SURE))
+def _differ(first: Array, second: Array) -> bool:
+    return bool(np.all(_shift(first, second) >= _SURE))
 
 
 def _finest_power(channel: Array, place: tuple[float, float]) -> float:
@@ -118,33 +121,33 @@ def _smooth(channel: Array, coarse: float = 3.0) -> Array:
     return np.asarray(fine / max(float(fine.std()), 1e-6), np.float32)
 
 
-def _shift(one: Array, other: Array) -> Array:
+def _shift(first: Array, second: Array) -> Array:
     """Share of blocks of a picture (H, W) that are found aside in another but not in place, and the 75th
     percentile of how far [px]."""
-    shrink = max(1.0, one.shape[1] / (2 * _COLUMNS))
-    size = round(one.shape[1] / shrink), round(one.shape[0] / shrink)
-    one, other = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (one, other))
-    count, far, reach = 0, list[int](), max(6, size[0] // 12)
+    shrink = max(1.0, first.shape[1] / (2 * _COLUMNS))
+    size = round(first.shape[1] / shrink), round(first.shape[0] / shrink)
+    first, second = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (first, second))
+    count, shifts, reach = 0, list[int](), max(6, size[0] // 12)
     for y in range(1, size[1] - _BLOCK, _BLOCK // 2):
         for x in range(reach, size[0] - _BLOCK - reach + 1, _BLOCK // 2):
-            block = one[y : y + _BLOCK, x : x + _BLOCK]
+            block = first[y : y + _BLOCK, x : x + _BLOCK]
             if block.std() < _FLAT:
                 continue
-            own = cv2.matchTemplate(
-                one[y : y + _BLOCK, x - reach : x + _BLOCK + reach], block, cv2.TM_CCOEFF_NORMED
+            self_scores = cv2.matchTemplate(
+                first[y : y + _BLOCK, x - reach : x + _BLOCK + reach], block, cv2.TM_CCOEFF_NORMED
             )
-            own[:, reach - 2 : reach + 3] = 0
-            if own.max() > _REPEATS:  # stripes are found everywhere
+            self_scores[:, reach - 2 : reach + 3] = 0
+            if self_scores.max() > _REPEATS:  # stripes are found everywhere
                 continue
             count += 1
-            around = other[y - 1 : y + _BLOCK + 1, x - reach : x + _BLOCK + reach]
-            scores = cv2.matchTemplate(around, block, cv2.TM_CCOEFF_NORMED).max(axis=0)
+            surroundings = second[y - 1 : y + _BLOCK + 1, x - reach : x + _BLOCK + reach]
+            scores = cv2.matchTemplate(surroundings, block, cv2.TM_CCOEFF_NORMED).max(axis=0)
             in_place = scores[reach - 1 : reach + 2].max()
             if scores.max() > max(_FOUND, in_place + _BETTER):
-                far.append(abs(int(scores.argmax()) - reach))
-    if count < _BLOCKS or not far:
+                shifts.append(abs(int(scores.argmax()) - reach))
+    if count < _BLOCKS or not shifts:
         return np.zeros(2)
-    return np.array([len(far) / count, float(np.percentile(far, 75))])
+    return np.array([len(shifts) / count, float(np.percentile(shifts, 75))])
 
 
 def split(rgb: Pixels, layout: str) -> tuple[Pixels, Pixels]:
@@ -153,11 +156,11 @@ def split(rgb: Pixels, layout: str) -> tuple[Pixels, Pixels]:
         return _split_lines(rgb, 0, layout), _split_lines(rgb, 1, layout)
     axis = 0 if layout in ("top-bottom", "half-height") else 1
     half = rgb.shape[axis] // 2
-    one, other = np.split(rgb.take(range(2 * half), axis), 2, axis)
+    left, right = np.split(rgb.take(range(2 * half), axis), 2, axis)
     if layout.startswith("half"):
-        size = one.shape[1] * (1 + axis), one.shape[0] * (2 - axis)
-        one, other = (cv2.resize(part, size, interpolation=cv2.INTER_CUBIC) for part in (one, other))
-    return one, other
+        size = left.shape[1] * (1 + axis), left.shape[0] * (2 - axis)
+        left, right = (cv2.resize(part, size, interpolation=cv2.INTER_CUBIC) for part in (left, right))
+    return left, right
 
 
 def _split_lines(rgb: Pixels, first: int, layout: str) -> Pixels:
@@ -168,25 +171,27 @@ def _split_lines(rgb: Pixels, first: int, layout: str) -> Pixels:
     return np.asarray(cv2.remap(lines, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def match(one: Array, other: Array, columns: int = _COLUMNS) -> tuple[float, float]:
+def match(first: Array, second: Array, columns: int = _COLUMNS) -> tuple[float, float]:
     """Share of blocks of a picture (H, W) that are in another about equally far aside, and how far [px]."""
-    shrink = max(1.0, one.shape[1] / columns)
-    size = round(one.shape[1] / shrink), round(one.shape[0] / shrink)
-    one, other = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (one, other))
-    count, found = 0, list[int]()
+    shrink = max(1.0, first.shape[1] / columns)
+    size = round(first.shape[1] / shrink), round(first.shape[0] / shrink)
+    first, second = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (first, second))
+    count, shifts = 0, list[int]()
     for y in range(_ROWS, size[1] - _BLOCK - _ROWS + 1, _BLOCK // 2):
         rows = slice(y - _ROWS, y + _BLOCK + _ROWS)
         for x in range(0, size[0] - _BLOCK + 1, _BLOCK // 2):
-            block = one[y : y + _BLOCK, x : x + _BLOCK]
+            block = first[y : y + _BLOCK, x : x + _BLOCK]
             if block.std() < _DETAIL:
                 continue
             count += 1
-            scores = (cv2.matchTemplate(both[rows], block, cv2.TM_CCOEFF_NORMED) for both in (one, other))
-            own, there = (score.max(axis=0) for score in scores)
-            own[max(0, x - _BLOCK // 2) : x + _BLOCK // 2] = 0
-            if there.max() > max(_ALIKE, own.max() + _BETTER):
-                found.append(int(there.argmax()) - x)
-    if count < _BLOCKS or not found:
+            scores = (
+                cv2.matchTemplate(searched[rows], block, cv2.TM_CCOEFF_NORMED) for searched in (first, second)
+            )
+            self_scores, other_scores = (score.max(axis=0) for score in scores)
+            self_scores[max(0, x - _BLOCK // 2) : x + _BLOCK // 2] = 0
+            if other_scores.max() > max(_ALIKE, self_scores.max() + _BETTER):
+                shifts.append(int(other_scores.argmax()) - x)
+    if count < _BLOCKS or not shifts:
         return 0.0, 0.0
-    near = np.abs(np.array(found) - np.median(found)) < size[0] / 12
-    return float(near.sum() / count), float(np.percentile(np.abs(found), 90))
+    consistent = np.abs(np.array(shifts) - np.median(shifts)) < size[0] / 12
+    return float(consistent.sum() / count), float(np.percentile(np.abs(shifts), 90))

@@ -28,11 +28,11 @@ def test_predict_and_score_agree_at_every_frame(
 ) -> None:
     loss = ["loss=mse"] if output == "vector" else []
     model = write_model(tmp_path / "model", f"arch.output={output}", *loss)
-    known = {"young_kpa": "unknown" if young is None else young}
-    folder = make(frames=13, fps=FPS, size=SIZE, footage="mp4", meta=known)
-    marked = np.zeros(SIZE, np.uint8)
-    marked[8:-8, 40:-90] = 255
-    cv2.imwrite(str(folder / "tissue.png"), marked)
+    meta = {"young_kpa": "unknown" if young is None else young}
+    folder = make(frames=13, fps=FPS, size=SIZE, footage="mp4", meta=meta)
+    tissue = np.zeros(SIZE, np.uint8)
+    tissue[8:-8, 40:-90] = 255
+    cv2.imwrite(str(folder / "tissue.png"), tissue)
     # The other methods are slow and not tested here.
     monkeypatch.setattr(comparison, "simpler_methods", dict)
 
@@ -41,20 +41,20 @@ def test_predict_and_score_agree_at_every_frame(
     run(learn.cli.app, "predict", *words, "-o", tmp_path / "forces", "--flow", "dis")
     run(bench.cli.app, "score", folder, "--model", model, "-o", tmp_path / "score", "--flow", "dis")
     curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
-    with np.load(tmp_path / "forces" / "video.npz") as found:
+    with np.load(tmp_path / "forces" / "video.npz") as prediction:
         # Every third of 25 frames a second, as close to ten as whole frames come; half as large as filmed.
-        assert found["frame"].tolist() == curve["frame"]
+        assert prediction["frame"].tolist() == curve["frame"]
         assert 4 <= len(curve["frame"]) < 13
-        assert found["time_s"] == pytest.approx(np.array(curve["t_s"]), abs=1e-6)
+        assert prediction["time_s"] == pytest.approx(np.array(curve["t_s"]), abs=1e-6)
         size = np.array(curve["predicted_mn"]["D2FNet"])
         assert size[0] < 1e-6 * size.max(), "nothing has moved in the rest frame"
         assert np.ptp(size[1:]) > 0.1 * size.max(), "the network's force must vary"
-        assert found["total_force_mn"] == pytest.approx(size, rel=1e-6, abs=1e-8)
+        assert prediction["total_force_mn"] == pytest.approx(size, rel=1e-6, abs=1e-8)
         if output == "vector":
             axes = np.array(curve["predicted_axes_mn"]["D2FNet"])
-            assert found["force_mn"] == pytest.approx(axes, rel=1e-6, abs=1e-8)
-        assert found["young_kpa"] == (young or 1.0)
-        assert bool(found["young_known"]) == (young is not None)
+            assert prediction["force_mn"] == pytest.approx(axes, rel=1e-6, abs=1e-8)
+        assert prediction["young_kpa"] == (young or 1.0)
+        assert bool(prediction["young_known"]) == (young is not None)
 
 
 @pytest.mark.slow
@@ -79,27 +79,29 @@ def test_estimate_and_score_agree_in_force_and_interval(make: Maker, tmp_path: P
     run(bench.cli.app, "estimate", *words, "--membrane", "stripped", "--ex-vivo", "-o", tmp_path / "forces")
     run(bench.cli.app, "score", folder, "-o", tmp_path / "score")
     curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
-    with np.load(tmp_path / "forces" / "video.npz") as found:
-        assert found["frame"].tolist() == curve["frame"]
+    with np.load(tmp_path / "forces" / "video.npz") as prediction:
+        assert prediction["frame"].tolist() == curve["frame"]
         size = np.array(curve["predicted_mn"]["physics"])
         assert np.ptp(size) > 0.1 * size.max() > 0
-        assert found["total_force_mn"] == pytest.approx(size, rel=1e-6)
+        assert prediction["total_force_mn"] == pytest.approx(size, rel=1e-6)
         for end in ("low_mn", "high_mn"):
             ends = curve.get(end, {}).get("physics")
-            assert (end in found) == (ends is not None), "an interval is stated by both or by neither"
+            assert (end in prediction) == (ends is not None), "an interval is stated by both or by neither"
             if ends is not None:
-                assert found[end] == pytest.approx(np.array(ends, np.float64), rel=1e-6, nan_ok=True)
-        low, high, force = (found[name] for name in ("low_mn", "high_mn", "total_force_mn"))
+                assert prediction[end] == pytest.approx(np.array(ends, np.float64), rel=1e-6, nan_ok=True)
+        low, high, force = (prediction[name] for name in ("low_mn", "high_mn", "total_force_mn"))
     about: dict[str, Any] = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "membrane": "stripped"}
     about |= {"living": False, "tissue": folder / "tissue.png"}
-    wide = bench.estimate(folder / "video.mp4", young_uncertainty=0.4, **about)
-    sure = np.isfinite(high)
-    added = 1.645 * 0.4 * force[sure]
-    assert wide["high_mn"][sure] == pytest.approx(
-        force[sure] + np.hypot(high[sure] - force[sure], added), rel=1e-3
+    widened = bench.estimate(folder / "video.mp4", young_uncertainty=0.4, **about)
+    is_finite = np.isfinite(high)
+    added = 1.645 * 0.4 * force[is_finite]
+    assert widened["high_mn"][is_finite] == pytest.approx(
+        force[is_finite] + np.hypot(high[is_finite] - force[is_finite], added), rel=1e-3
     )
-    assert (wide["low_mn"][sure] <= low[sure]).all()
-    with np.load(tmp_path / "forces" / "video.npz") as found:
-        total = found["density"].sum(axis=(1, 2, 3)) * found["pitch_mm"] ** 2
-        assert (total >= 0.95 * np.linalg.norm(found["force_mn"], axis=1)).all(), "lengths sum up to more"
+    assert (widened["low_mn"][is_finite] <= low[is_finite]).all()
+    with np.load(tmp_path / "forces" / "video.npz") as prediction:
+        total = prediction["density"].sum(axis=(1, 2, 3)) * prediction["pitch_mm"] ** 2
+        assert (total >= 0.95 * np.linalg.norm(prediction["force_mn"], axis=1)).all(), (
+            "lengths sum up to more"
+        )
     assert (tmp_path / "forces" / "video.force.csv").stat().st_size > 0

@@ -46,9 +46,9 @@ def picture() -> dict[str, Any]:
 
 
 def change(probe: str, before: dict[str, Any], now: dict[str, Any]) -> Change:
-    each = compare_all(sketch_all(before), sketch_all(now))
-    array = max(each, key=lambda name: each[name])
-    return Change(probe, each[array], array)
+    differences = compare_all(sketch_all(before), sketch_all(now))
+    array = max(differences, key=lambda name: differences[name])
+    return Change(probe, differences[array], array)
 
 
 FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -79,24 +79,24 @@ def test_more_stiffness_and_a_lost_pulse_move_the_mechanics(monkeypatch: pytest.
     before = probes.probe_mechanics()
     equations = fem_mechanics.solver.deform
 
-    def stiffer(fem: Any, tissue: Any, *rest: Any, **named: Any) -> synth.Deformation:
-        return equations(fem, replace(tissue, young_kpa=1.01 * tissue.young_kpa), *rest, **named)
+    def stiffen(fem: Any, tissue: Any, *rest: Any, **options: Any) -> synth.Deformation:
+        return equations(fem, replace(tissue, young_kpa=1.01 * tissue.young_kpa), *rest, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fem_mechanics.solver, "deform", stiffer)
+        patch.setattr(fem_mechanics.solver, "deform", stiffen)
         assert change("mechanics", before, probes.probe_mechanics()).moved
     with monkeypatch.context() as patch:
         patch.setattr(Pulse, "height", lambda self, time: np.zeros(len(time)))
-        seen = change("mechanics", before, probes.probe_mechanics())
-    assert seen.moved
-    assert seen.array.startswith("pulse")
+        pulse_change = change("mechanics", before, probes.probe_mechanics())
+    assert pulse_change.moved
+    assert pulse_change.array.startswith("pulse")
 
 
 @pytest.mark.slow
 def test_a_swapped_camera_moves_the_stereo_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     before, other = probes.probe_stereo(), {"frames": "right", "right": "frames"}
-    read = probes._stored_pictures
-    monkeypatch.setattr(probes, "_stored_pictures", lambda name, folder: read(name, other[folder]))
+    read = probes._read_pictures
+    monkeypatch.setattr(probes, "_read_pictures", lambda name, folder: read(name, other[folder]))
     assert change("stereo", before, probes.probe_stereo()).moved
 
 
@@ -110,10 +110,10 @@ def test_comments_and_names_and_folders_are_not_seen(tmp_path: Path) -> None:
     for path in [*(tmp_path / "synth/geometry").rglob("*.py"), *(tmp_path / "synth/fem/mesh").rglob("*.py")]:
         path.write_text("# a comment\n" + ast.unparse(ast.parse(path.read_text("utf-8"))))
     program = "import json; from evidence.guard.guard import run_probe; print(json.dumps(run_probe('mesh')))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    now = json.loads(done.stdout)
-    assert not guard.compare({"mesh": guard.stored()["mesh"]}, {"mesh": now})[0].moved
+    result = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    now = json.loads(result.stdout)
+    assert not guard.compare({"mesh": guard.read_sketches()["mesh"]}, {"mesh": now})[0].moved
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_a_probe_is_as_stored(name: str, request: pytest.FixtureRequest) -> None
     """Or `make guard ACCEPT=1`, after its version was raised, says what this change moves."""
     fixture = name in ("truth", "picture")
     sketches = sketch_all(request.getfixturevalue(name)) if fixture else guard.run_probe(name)
-    (found,) = guard.compare(guard.stored(), {name: sketches})
-    assert not found.moved, found.text()
+    (outcome,) = guard.compare(guard.read_sketches(), {name: sketches})
+    assert not outcome.moved, outcome.text()
 
 
 def test_a_sketch_estimates_the_size_of_a_change() -> None:
@@ -142,17 +142,17 @@ def test_a_sketch_estimates_the_size_of_a_change() -> None:
 
 
 def test_a_moved_probe_needs_a_raised_version() -> None:
-    known = guard.versions()
+    versions = guard.versions()
     moved, still = Change("flow", 0.5, "flow"), Change("flow", 1e-3, "flow")
-    assert guard.find_unraised([moved], known, known)
-    assert not guard.find_unraised([moved], known, known | {"MOTION": known["MOTION"] + 1})
-    assert guard.find_unraised([moved], known, known | {"MESH": known["MESH"] + 1})
-    assert not guard.find_unraised([still], known, known)
-    assert guard.stored_versions() == known, "raised without `make guard ACCEPT=1`, or not stored"
+    assert guard.find_unraised([moved], versions, versions)
+    assert not guard.find_unraised([moved], versions, versions | {"MOTION": versions["MOTION"] + 1})
+    assert guard.find_unraised([moved], versions, versions | {"MESH": versions["MESH"] + 1})
+    assert not guard.find_unraised([still], versions, versions)
+    assert guard.read_versions() == versions, "raised without `make guard ACCEPT=1`, or not stored"
 
 
 def test_a_result_says_what_has_moved_since(tmp_path: Path) -> None:
-    today = guard.stored()
+    today = guard.read_sketches()
     other = json.loads(json.dumps(today["flow"]))
     other["flow"]["projections"] = [-value for value in other["flow"]["projections"]]
     results = {
@@ -165,28 +165,28 @@ def test_a_result_says_what_has_moved_since(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "result.json").write_text(json.dumps(result))
         (tmp_path / name / "README.md").write_text("# Title\n\nText.\n")
-    states = {one.file.parent.name: one for one in result_status.gather(tmp_path)}
-    assert {name: one.stands for name, one in states.items()} == dict.fromkeys(results, False) | {
+    states = {state.file.parent.name: state for state in result_status.gather(tmp_path)}
+    assert {name: state.stands for name, state in states.items()} == dict.fromkeys(results, False) | {
         "stands": True
     }
-    assert [one.probe for one in states["moved"].moved] == ["flow"]
+    assert [moved_probe.probe for moved_probe in states["moved"].moved] == ["flow"]
     for _ in range(2):  # the line is replaced, not repeated
         result_status.write_states(tmp_path)
-        for name, one in states.items():
+        for name, state in states.items():
             text = (tmp_path / name / "README.md").read_text()
-            assert text == f"# Title\n\n*State: {one.describe()}.*\n\nText.\n"
+            assert text == f"# Title\n\n*State: {state.describe()}.*\n\nText.\n"
 
 
 def test_pages_state_whether_their_results_stand(tmp_path: Path) -> None:
-    for one in result_status.gather():
-        page = one.file.with_name("README.md")
-        assert f"*State: {one.describe()}.*" in page.read_text("utf-8"), "python -m evidence status --write"
+    for state in result_status.gather():
+        page = state.file.with_name("README.md")
+        assert f"*State: {state.describe()}.*" in page.read_text("utf-8"), "python -m evidence status --write"
 
 
 @pytest.mark.parametrize("name", [name for name in study.names() if study.load(name).result])
 def test_a_study_needs_probes_of_all_that_it_imports(name: str) -> None:
     path = ROOT / "evidence" / f"{name.replace('.', '/')}.py"
-    covered = [package for probe in study.load(name).needs for package in PROBES[probe].packages]
+    covered_packages = [package for probe in study.load(name).needs for package in PROBES[probe].packages]
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -197,5 +197,5 @@ def test_a_study_needs_probes_of_all_that_it_imports(name: str) -> None:
                 or not (ROOT / place).with_suffix(".py").exists()
             ):
                 continue
-            inside = place.count("/") == 1 or place.startswith((*covered, *NEUTRAL))
+            inside = place.count("/") == 1 or place.startswith((*covered_packages, *NEUTRAL))
             assert inside, f"{name} imports {module}, which none of its probes covers"

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from evidence.appearance.likeness import covered, kernel_distance, vessel_lengths
+from evidence.appearance.likeness import find_covered, kernel_distance, vessel_lengths
 
 MM_PER_PX = 0.055
 
@@ -12,8 +12,8 @@ MM_PER_PX = 0.055
 def test_kernel_distance_is_zero_of_one_distribution_and_grows_with_a_shift() -> None:
     rng = np.random.default_rng(0)
     values = rng.standard_normal((3, 400, 8))
-    same, near, far = (kernel_distance(values[0], values[1] + shift) for shift in (0.0, 0.3, 1.0))
-    assert abs(same) < 0.05 < near < far
+    d_same, d_near, d_far = (kernel_distance(values[0], values[1] + shift) for shift in (0.0, 0.3, 1.0))
+    assert abs(d_same) < 0.05 < d_near < d_far
 
 
 def test_kernel_distance_of_single_values_is_that_of_the_definition() -> None:
@@ -26,17 +26,17 @@ def test_kernel_distance_of_single_values_is_that_of_the_definition() -> None:
 def test_coverage_counts_crops_with_a_rendered_one_among_their_neighbours() -> None:
     theirs = np.arange(8.0)[:, None]
     alone = np.eye(8, dtype=bool)
-    assert covered(theirs, theirs + 0.1, alone, k=1).all()
-    assert np.flatnonzero(covered(theirs, np.array([[2.1]]), alone, k=1)).tolist() == [2, 3]
-    assert not covered(theirs, np.array([[100.0]]), alone).any()
+    assert find_covered(theirs, theirs + 0.1, alone, k=1).all()
+    assert np.flatnonzero(find_covered(theirs, np.array([[2.1]]), alone, k=1)).tolist() == [2, 3]
+    assert not find_covered(theirs, np.array([[100.0]]), alone).any()
 
 
 def test_what_overlaps_is_no_neighbour() -> None:
     theirs, ours = np.array([[0.0], [0.1], [5.0], [9.0]]), np.array([[1.5]])
     apart, overlapping = np.eye(4, dtype=bool), np.eye(4, dtype=bool)
     overlapping[:2, :2] = True
-    assert covered(theirs, ours, apart, k=1).tolist() == [False, False, True, False]
-    assert covered(theirs, ours, overlapping, k=1).tolist() == [True, True, True, False]
+    assert find_covered(theirs, ours, apart, k=1).tolist() == [False, False, True, False]
+    assert find_covered(theirs, ours, overlapping, k=1).tolist() == [True, True, True, False]
 
 
 @pytest.mark.parametrize(("calibre_mm", "place"), [(0.22, 1), (0.5, 2)])
@@ -52,7 +52,7 @@ def test_lengths_of_drawn_vessels(calibre_mm: float, place: int) -> None:
     inside = np.zeros((side, side), bool)
     inside[10:-10, 10:-10] = True
     lengths, line = vessel_lengths(picture, inside, MM_PER_PX)
-    whole = 3 / (140 * MM_PER_PX)  # each vessel is as long as the field
-    assert lengths[place] == pytest.approx(whole, rel=0.25)
+    expected = 3 / (140 * MM_PER_PX)  # each vessel is as long as the field
+    assert lengths[place] == pytest.approx(expected, rel=0.25)
     assert lengths.sum() == pytest.approx(lengths[place], rel=0.2)
     assert line.shape == (3 * side, 3 * side)

@@ -25,15 +25,15 @@ def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pyte
         tmp_path,
         "found.json",
         {"third": 1 / 3, "rows": ROWS},
-        lambda found: Page("Title", found, chart=CHART),
+        lambda document: Page("Title", document, chart=CHART),
     )
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert list(found) == ["command", "commit", "date", "machine", "cpu_hours", "third", "rows"]
-    assert found["command"].endswith("where.csv --cache=b --seeds 3")
-    assert found["third"] == 0.333333
-    again = found | {"commit": "1234567"}
-    report.save(tmp_path, "found.json", again)
-    assert json.loads((tmp_path / "found.json").read_text()) == again
+    document = json.loads((tmp_path / "found.json").read_text())
+    assert list(document) == ["command", "commit", "date", "machine", "cpu_hours", "third", "rows"]
+    assert document["command"].endswith("where.csv --cache=b --seeds 3")
+    assert document["third"] == 0.333333
+    updated = document | {"commit": "1234567"}
+    report.save(tmp_path, "found.json", updated)
+    assert json.loads((tmp_path / "found.json").read_text()) == updated
     text = " ".join(ElementTree.fromstring((tmp_path / "chart.svg").read_text()).itertext())
     assert all(value in text for value in ("mN", "ours", "<theirs>"))
 
@@ -48,30 +48,30 @@ DRAWN = [name for name in study.names() if name not in POOLED]
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_the_page_of_a_study_is_drawn_from_its_stored_data(name: str, tmp_path: Path) -> None:
-    one = study.load(name)
-    if one.page is None:
-        assert not one.result
+    entry = study.load(name)
+    if entry.page is None:
+        assert not entry.result
         return
-    found = json.loads((report.RESULTS / one.result).read_text("utf-8"))
-    one.page(found).write(tmp_path)
+    document = json.loads((report.RESULTS / entry.result).read_text("utf-8"))
+    entry.page(document).write(tmp_path)
     assert (tmp_path / "README.md").read_text("utf-8").startswith("# ")
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_figures_of_a_network_card_are_those_of_the_stored_result(name: str) -> None:
     rows = json.loads((report.RESULTS / "learn/shipped/shipped.json").read_text("utf-8"))["rows"]
-    shown = (MODELS / name / "README.md").read_text("utf-8")
-    listed = shipped.listed([row for row in rows if row["model"] == name])
-    assert len(listed) == 2
-    assert all(f"| {what} | {figures} |\n" in shown for what, figures in listed.items())
+    page = (MODELS / name / "README.md").read_text("utf-8")
+    figures_by_name = shipped.list_figures([row for row in rows if row["model"] == name])
+    assert len(figures_by_name) == 2
+    assert all(f"| {label} | {figures} |\n" in page for label, figures in figures_by_name.items())
 
 
 def test_every_stored_result_has_its_study() -> None:
     results = [study.load(name).result for name in study.names()]
-    found = [{*report.RESULTS.glob(result)} for result in results if result]
-    assert all(found)
-    assert set.union(*found) == {*report.RESULTS.rglob("*.json")} - {guard.FILE}
-    assert sum(map(len, found)) == len(set.union(*found))
+    files = [{*report.RESULTS.glob(result)} for result in results if result]
+    assert all(files)
+    assert set.union(*files) == {*report.RESULTS.rglob("*.json")} - {guard.FILE}
+    assert sum(map(len, files)) == len(set.union(*files))
 
 
 def test_every_study_accepts_the_arguments_of_its_steps(tmp_path: Path) -> None:
@@ -119,5 +119,5 @@ def test_studies_run_side_by_side_and_those_that_hold_times_last(tmp_path: Path)
 
 
 def test_only_results_that_moved_are_made_again(tmp_path: Path) -> None:
-    steps, _ = everything.plan(tmp_path, {}, "fem", left={"fem.pareto"})
+    steps, _ = everything.plan(tmp_path, {}, "fem", excluded={"fem.pareto"})
     assert {name for name, _ in steps} == {"fem.relief", "fem.loads", "fem.solvers"}

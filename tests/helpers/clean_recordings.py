@@ -76,8 +76,8 @@ def all_cases() -> list[Case]:
 def load_mn(time_s: Floats) -> Floats:
     """Force (T, 3) mN on the tissue, camera axes: a press that drags to the right, one that drags upwards."""
     first, second = _hold(time_s, 1.2, 2.4), _hold(time_s, 2.9, 4.1)
-    both = np.outer(first, [25.0, 8.0, 45.0]) + np.outer(second, [-6.0, -30.0, 30.0])
-    return np.asarray(both, np.float64)
+    forces = np.outer(first, [25.0, 8.0, 45.0]) + np.outer(second, [-6.0, -30.0, 30.0])
+    return np.asarray(forces, np.float64)
 
 
 def _hold(time_s: Floats, start: float, stop: float) -> Floats:
@@ -109,14 +109,14 @@ class Scene:
         self.contact = np.array([0.55 * width, 0.5 * height])
         self.rng = rng
 
-    def motion_px(self, force_mn: Floats, at: Floats) -> Floats:
-        """Motion (H, W, 2) px of points `at` (H, W, 2) px under a load at the contact."""
+    def motion_px(self, force_mn: Floats, points: Floats) -> Floats:
+        """Motion (H, W, 2) px of `points` (H, W, 2) px under a load at the contact."""
         shear_kpa = YOUNG_KPA / (2 * (1 + POISSON))
-        x, y = np.moveaxis((at - self.contact) * self.mm_per_px, -1, 0)
+        x, y = np.moveaxis((points - self.contact) * self.mm_per_px, -1, 0)
         r = np.sqrt(x * x + y * y + PATCH_MM**2)
         fx, fy, fz = force_mn / (4 * np.pi * shear_kpa)
-        along = 2 * (fx * x + fy * y) * POISSON / r**3 - (1 - 2 * POISSON) * fz / r**2
-        ux, uy = 2 * (1 - POISSON) * fx / r + along * x, 2 * (1 - POISSON) * fy / r + along * y
+        radial = 2 * (fx * x + fy * y) * POISSON / r**3 - (1 - 2 * POISSON) * fz / r**2
+        ux, uy = 2 * (1 - POISSON) * fx / r + radial * x, 2 * (1 - POISSON) * fy / r + radial * y
         return np.asarray(np.stack([ux, uy], -1) / self.mm_per_px)
 
     def draw(self, time_s: float) -> tuple[Floats, NDArray[np.bool_]]:
@@ -124,8 +124,8 @@ class Scene:
         height, width = self.size
         force = load_mn(np.array([time_s]))[0]
         places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
-        moved = self.motion_px(force, places - self.motion_px(force, places))
-        source = (places - moved).astype(np.float32)
+        displacement = self.motion_px(force, places - self.motion_px(force, places))
+        source = (places - displacement).astype(np.float32)
         picture = cv2.remap(
             self.rest, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
         )
@@ -136,11 +136,11 @@ class Scene:
             + away * np.array([0.65, -0.3]) * width
         )
         rod = np.zeros(self.size, np.uint8)
-        shade, wide = rod.copy(), max(5, width // 20)
-        far = tip + 2.0 * width * np.array([0.9, -0.42])
-        for canvas, shift in ((shade, wide // 3), (rod, 0)):
-            start, stop = ([int(v) for v in np.rint(16 * (end + shift))] for end in (tip, far))
-            cv2.line(canvas, start, stop, 255, wide, cv2.LINE_AA, 4)
+        shade, rod_px = rod.copy(), max(5, width // 20)
+        shaft_end = tip + 2.0 * width * np.array([0.9, -0.42])
+        for canvas, shift in ((shade, rod_px // 3), (rod, 0)):
+            start, stop = ([int(v) for v in np.rint(16 * (end + shift))] for end in (tip, shaft_end))
+            cv2.line(canvas, start, stop, 255, rod_px, cv2.LINE_AA, 4)
         picture = picture * (1 - 0.3 * cv2.GaussianBlur(shade, (0, 0), 2)[..., None] / 255.0)
         steel = np.array([150.0, 155.0, 160.0]) + 25 * np.sin(places[..., :1] / 7)
         alpha = rod[..., None] / 255.0
@@ -158,11 +158,11 @@ def make(root: Path, case: Case) -> Path:
     folder = root / case.name
     folder.mkdir(parents=True)
     time_s, scene = np.arange(round(SECONDS * FPS)) / FPS, Scene(case.size, case.seed)
-    taken = [scene.take(float(t), case.colour) for t in time_s]
-    write_pictures(folder, case, [picture for picture, _ in taken], time_s)
+    shots = [scene.take(float(t), case.colour) for t in time_s]
+    write_pictures(folder, case, [picture for picture, _ in shots], time_s)
     if case.masks:
         (folder / "masks").mkdir()
-        for k, (_, rod) in enumerate(taken):
+        for k, (_, rod) in enumerate(shots):
             cv2.imwrite(str(folder / "masks" / f"{k:06d}.png"), rod.astype(np.uint8) * 255)
         cv2.imwrite(str(folder / "tissue.png"), np.full(case.size, 255, np.uint8))
     sensor = write_sensor(folder, case)
@@ -183,19 +183,19 @@ def make(root: Path, case: Case) -> Path:
 def write_pictures(folder: Path, case: Case, pictures: list[Floats], time_s: Floats) -> None:
     """Writes the video, or pictures with their times."""
     height, width = case.size
-    rounded = [np.rint(picture).astype(np.uint8) for picture in pictures]
+    pictures_8bit = [np.rint(picture).astype(np.uint8) for picture in pictures]
     if case.codec == "png":
         (folder / "frames").mkdir()
         for k, picture in enumerate(pictures):
-            stored = np.rint(picture * 4).astype(np.uint16) if case.colour == "10 bits" else rounded[k]
-            cv2.imwrite(str(folder / "frames" / f"{k:06d}.png"), np.ascontiguousarray(stored[..., ::-1]))
+            levels = np.rint(picture * 4).astype(np.uint16) if case.colour == "10 bits" else pictures_8bit[k]
+            cv2.imwrite(str(folder / "frames" / f"{k:06d}.png"), np.ascontiguousarray(levels[..., ::-1]))
         recording_writer.write_frames(folder, time_s)
     elif case.codec == "mp4v":
         video = cv2.VideoWriter(
             str(folder / "video.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (width, height)
         )
-        for coloured in rounded:
-            video.write(np.ascontiguousarray(coloured[..., ::-1]))
+        for rgb in pictures_8bit:
+            video.write(np.ascontiguousarray(rgb[..., ::-1]))
         video.release()
     else:
         h264 = case.codec == "h264"
@@ -204,7 +204,7 @@ def write_pictures(folder: Path, case: Case, pictures: list[Floats], time_s: Flo
             stream = container.add_stream("libx264" if h264 else "mjpeg", rate=Fraction(FPS), options=options)
             stream.width, stream.height = width, height
             stream.pix_fmt = "yuv420p" if h264 else "yuvj420p"
-            for packet in _encode(stream, rounded):
+            for packet in _encode(stream, pictures_8bit):
                 container.mux(packet)
 
 
@@ -235,12 +235,12 @@ class Fit:
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         height, width = frame.confidence.shape
-        here = Scene((height, width), 0)
+        rest_scene = Scene((height, width), 0)
         places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)[::4, ::4].astype(float)
         weight = frame.confidence[::4, ::4, None]
-        fields = [(weight * here.motion_px(axis, places)).ravel() for axis in np.eye(3)]
-        seen = (weight * frame.flow[::4, ::4]).ravel()
-        force = np.linalg.lstsq(np.stack(fields, -1), seen, rcond=None)[0]
+        fields = [(weight * rest_scene.motion_px(axis, places)).ravel() for axis in np.eye(3)]
+        flow = (weight * frame.flow[::4, ::4]).ravel()
+        force = np.linalg.lstsq(np.stack(fields, -1), flow, rcond=None)[0]
         size = float(np.linalg.norm(force))
         return ForceEstimate(
             force, np.zeros((height, width), np.float32) if picture else None, 0.6 * size, 1.4 * size + 2

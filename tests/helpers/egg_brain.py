@@ -17,7 +17,7 @@ def soup() -> np.ndarray:
     return np.asarray(ball.vertices[np.concatenate([ball.faces[20:], ball.faces[40:60]])])
 
 
-def written(path: Path, corner: np.ndarray) -> Path:
+def write_triangles(path: Path, corner: np.ndarray) -> Path:
     """Triangles (F, 3, 3) as a file of the format that its name says, vertices unmerged."""
     if path.suffix != ".vtk":
         trimesh.Trimesh(**trimesh.triangles.to_kwargs(corner), process=False).export(path)

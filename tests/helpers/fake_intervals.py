@@ -27,9 +27,9 @@ def make(frame_limit: float = 1e6) -> Intervals:
         return Spread(scale, dict(FACTORS))
 
     count = len(names) - len(ESTIMATE)
-    along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
+    precision = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
     size, *axes = (spread(half, len(names)) for half in (5.0, 3.0, 4.0, 50.0))
-    distribution = MotionDistribution((0.0,) * count, along, frame_limit)
+    distribution = MotionDistribution((0.0,) * count, precision, frame_limit)
     return Intervals(names, 100.0, size, tuple(axes), distribution, "recovered", 19, 19)
 
 

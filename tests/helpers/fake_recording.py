@@ -28,7 +28,7 @@ def texture(height: int, width: int, seed: int | np.random.Generator = 0) -> NDA
     return np.asarray(np.clip(grey[..., None] * [1.1, 0.7, 0.6], 0, 210), np.uint8)
 
 
-def pushed(rest: NDArray[np.uint8], peak_px: float) -> NDArray[np.uint8]:
+def push_texture(rest: NDArray[np.uint8], peak_px: float) -> NDArray[np.uint8]:
     """The texture (H, W, 3) moved to the right by a bump of `peak_px` at the centre."""
     height, width = rest.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
@@ -62,7 +62,7 @@ class Maker:
         (folder / "frames").mkdir(parents=True)
         time = np.arange(frames) / fps
         rest = texture(*size)
-        pictures = [pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
+        pictures = [push_texture(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
         if footage == "png":
             for k, rgb in enumerate(pictures):
                 cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
@@ -73,13 +73,13 @@ class Maker:
         t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
         recording_writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
-        known = {"membrane": "stripped", "poisson": [0.45, 0.45]}  # two tissues to solve, not twelve
-        recording_writer.write_meta(folder, {**about, **known, **(meta or {})})
+        tissue = {"membrane": "stripped", "poisson": [0.45, 0.45]}  # two tissues to solve, not twelve
+        recording_writer.write_meta(folder, {**about, **tissue, **(meta or {})})
         return folder
 
 
 class Bump:
-    """The inverse of `pushed`: the exact force from the displacement at the centre."""
+    """The inverse of `push_texture`: the exact force from the displacement at the centre."""
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         length = np.linalg.norm(frame.flow, axis=-1)
@@ -89,11 +89,13 @@ class Bump:
         return ForceEstimate(np.array([force, 0.0, 0.0]), length.astype(np.float32) if picture else None)
 
 
-def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings: Any) -> Result:
+def score_recording(folder: Path, methods: Mapping[str, Method] | None = None, **settings: Any) -> Result:
     """The result of scoring a recording; by default `Bump` on every frame, in this process."""
     recording = open_recording(folder)
-    chosen = dict(methods or {"bump": Bump()})
+    methods_by_name = dict(methods or {"bump": Bump()})
     flow = settings.pop("flow_here", None)
     chosen_settings = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
     scale = recording.scale
-    return evaluate_recording(recording, chosen, next(iter(chosen)), scale, chosen_settings, {}, flow=flow)
+    return evaluate_recording(
+        recording, methods_by_name, next(iter(methods_by_name)), scale, chosen_settings, {}, flow=flow
+    )

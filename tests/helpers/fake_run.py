@@ -34,8 +34,8 @@ class Silent(Watcher):
         self.attempts.append((attempt, again))
 
 
-def options(work: str, **more: object) -> Options:
-    return Options(work=f"fake_work:{work}", **{"workers": 1, "mix_versions": True, **more})  # type: ignore[arg-type]
+def options(work: str, **settings: object) -> Options:
+    return Options(work=f"fake_work:{work}", **{"workers": 1, "mix_versions": True, **settings})  # type: ignore[arg-type]
 
 
 def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
@@ -61,8 +61,8 @@ def start(root: Path, job: Job, work: str, part: str = "") -> subprocess.Popen[b
 
 def run_here(root: Path, job: str, work: str, part: str) -> None:
     """The run in the process of `start`."""
-    given = options(work, part=parse_part(part) if part else None)
-    run_job(Job.model_validate_json(job), root, given, Silent())
+    run_options = options(work, part=parse_part(part) if part else None)
+    run_job(Job.model_validate_json(job), root, run_options, Silent())
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:

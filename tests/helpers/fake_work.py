@@ -47,16 +47,16 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
+def fail_by_index(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """Sequence 1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 and 8 are refused, 7 fails once."""
     if index == 1:
         report("render", 0, 1)
         os.abort()
     if index == 2:
-        held = []
+        blocks = []
         while True:
-            held.append(np.ones(1 << 22))
-            report("fem", len(held), 1 << 20)
+            blocks.append(np.ones(1 << 22))
+            report("fem", len(blocks), 1 << 20)
     if index == 3:
         writer = Writer(folder, index, frames=job.frames, size=(8, 8), job=job)
         writer.put("force", np.full((job.frames, 3), np.nan))
@@ -65,20 +65,20 @@ def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> No
     if index in (6, 8):
         raise UserError("the load is past the material's range")
     if index == 7:
-        tried = folder / ".run" / "tried"
-        if not tried.exists():
-            tried.touch()
+        marker = folder / ".run" / "tried"
+        if not marker.exists():
+            marker.touch()
             os.kill(os.getpid(), 9)
     sequence(job, index, folder, report)
 
 
-def seeing(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
+def record_gpus(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """A slow sequence that writes the GPUs visible to it into a file, so that every worker gets one."""
     (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "unset"))
     slow(job, index, folder, report)
 
 
-def hanging(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
+def hang(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """A sequence that takes ten minutes."""
     time.sleep(600)
 
@@ -132,55 +132,58 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
     writer.put("tissue", tissue & (fault != "no_tissue"))
     writer.put("area", area)
     for t in range(frames):
-        moved = 6.0 * share[t]
+        shift_px = 6.0 * share[t]
         tool = columns < 6
         flow = np.zeros((height, width, 2))
-        flow[tissue, 0] = -moved if fault == "flow" else moved
+        flow[tissue, 0] = -shift_px if fault == "flow" else shift_px
         flow[tissue, 1] = 1.0 if fault == "rest" and t == 0 else 0.0
         if fault == "fold" and t:
             flow[tissue, 0] -= 2 * (columns - width / 2)[tissue] * (np.abs(columns - width / 2) < 10)[tissue]
         recovered = flow + (0.1 if fault == "recovered_rest" else 0.0)
-        picture = texture(rows, columns - moved) * (fault != "black")
-        gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
+        picture = texture(rows, columns - shift_px) * (fault != "black")
+        is_outside = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
         writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
         writer.put_frame("flow", t, flow)
-        covered = tool | (np.abs(rows - height / 2) < 8) if fault == "visibility" else tool
-        writer.put_frame("visible", t, ~gone)
-        writer.put_frame("tool", t, covered)
+        occlusion = tool | (np.abs(rows - height / 2) < 8) if fault == "visibility" else tool
+        writer.put_frame("visible", t, ~is_outside)
+        writer.put_frame("tool", t, occlusion)
         writer.put_frame("glare", t, np.zeros_like(tissue))
         writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
-        pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t] * pressing
-        writer.put_frame("traction", t, pressed * spot[..., None] * load)
+        load_share = 1e-3 if fault == "load_rest" and t == 0 else share[t] * pressing
+        writer.put_frame("traction", t, load_share * spot[..., None] * load)
         if job.render.stereo_mm:
-            aside = np.zeros((height, width, 3))
-            aside[..., 0] = flow[..., 0] * distance / focal
-            aside[..., 2] = 0.1 * tissue if fault == "motion" else 0.0
-            writer.put_frame("motion", t, aside)
+            motion = np.zeros((height, width, 3))
+            motion[..., 0] = flow[..., 0] * distance / focal
+            motion[..., 2] = 0.1 * tissue if fault == "motion" else 0.0
+            writer.put_frame("motion", t, motion)
             writer.put_frame("rgb_right", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
             writer.put_frame("flow_right", t, -flow if fault == "right_flow" else flow)
-            writer.put_frame("visible_right", t, ~gone)
+            writer.put_frame("visible_right", t, ~is_outside)
             writer.put_frame("depth_right", t, np.full((height, width), distance + (fault == "right_depth")))
         writer.put_frame("flow_recovered", t, recovered)
         writer.put_frame("flow_confidence", t, np.ones((height, width)))
     writer.put("disparity", np.full((height, width), 1.0 if fault == "disparity" else 0.0))
     baseline = job.render.stereo_mm
-    shifted = width / 2 + focal * baseline / distance
-    both = {"distortion": [0.0] * 5, "rotation": np.eye(3).tolist()}
-    right = both | {"K": [[focal, 0, shifted], [0, focal, height / 2], [0, 0, 1]], "baseline_mm": baseline}
+    right_centre_px = width / 2 + focal * baseline / distance
+    calibration = {"distortion": [0.0] * 5, "rotation": np.eye(3).tolist()}
+    right = calibration | {
+        "K": [[focal, 0, right_centre_px], [0, focal, height / 2], [0, 0, 1]],
+        "baseline_mm": baseline,
+    }
     right["translation"] = [-baseline, 0.0, distance]
     focal *= 0.5 if fault == "camera" else 1.0
     tip = np.zeros((frames, 2, 3))
     tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
     energy = 0.4 * np.square(share) * (load @ load)
     energy[-1] *= 1.7 if fault == "compliance" else 1.0
-    described = attributes(index, rng)
-    described["scenario"]["gestures"][0]["footprint_mm"] = 3.0
-    described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
-    described["translation"] = [0.0, 0.0, distance]
-    described["K"] = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    attrs = attributes(index, rng)
+    attrs["scenario"]["gestures"][0]["footprint_mm"] = 3.0
+    attrs["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
+    attrs["translation"] = [0.0, 0.0, distance]
+    attrs["K"] = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     instruments = [{"tip_mm": tip.tolist(), "force_mn": force.tolist()}]
     mechanics = {"elastic": True, "energy_mn_mm": energy.tolist(), "instruments": instruments}
-    writer.seal(**described, **both, **({"right": right} if baseline else {}), mechanics=mechanics)
+    writer.seal(**attrs, **calibration, **({"right": right} if baseline else {}), mechanics=mechanics)
 
 
 def _texture(rng: np.random.Generator) -> Callable[..., Any]:

@@ -88,8 +88,8 @@ def serve(fd: int) -> None:
             if not os.fork():
                 requests.close()
                 _keep(json.loads(text), fds)
-            for each in fds:
-                os.close(each)
+            for worker_fd in fds:
+                os.close(worker_fd)
 
 
 def _keep(environment: dict[str, str], fds: list[int]) -> None:
@@ -99,8 +99,8 @@ def _keep(environment: dict[str, str], fds: list[int]) -> None:
     worker = os.fork()
     if not worker:
         _work(environment, status, stdin, report)
-    for each in fds[1:]:
-        os.close(each)
+    for fd in fds[1:]:
+        os.close(fd)
     code = os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1])
     with contextlib.suppress(BrokenPipeError):
         os.write(status, f"{code}\n".encode())

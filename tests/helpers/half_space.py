@@ -30,35 +30,39 @@ def errors(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     system = assemble(free, "linear", poisson, MembraneSheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
-    at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)
-    load = surface_embedding.embed(free, np.column_stack([at, np.zeros(len(at))]))
+    points = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)
+    load = surface_embedding.embed(free, np.column_stack([points, np.zeros(len(points))]))
     inside, outside = np.linspace(0.15, 0.85, 8) * a, np.linspace(1.15, 2.0, 8) * a
     rows: list[Row] = []
     for disc in ("uniform", "hertz", "tangential"):
         share = np.repeat(np.sqrt(1 - (ring / a) ** 2) if disc == "hertz" else np.ones(_RINGS), _SPOKES)
         share /= share.sum()
-        way = np.array([1.0, 0.0, 0.0] if disc == "tangential" else [0.0, 0.0, -1.0])
+        direction = np.array([1.0, 0.0, 0.0] if disc == "tangential" else [0.0, 0.0, -1.0])
         fixed = free.points[free.fixed]
         shell = np.zeros_like(free.points)
-        shell[free.fixed] = point_loads(fixed, at[::7], share[::7] / share[::7].sum(), way, poisson)
-        held = (system.stiffness @ shell.ravel()).reshape(-1, 3)
-        u = shell + system.solve(load.gather(np.outer(share, way)) - held)
+        shell[free.fixed] = point_loads(fixed, points[::7], share[::7] / share[::7].sum(), direction, poisson)
+        shell_force = (system.stiffness @ shell.ravel()).reshape(-1, 3)
+        u = shell + system.solve(load.gather(np.outer(share, direction)) - shell_force)
         for place, radii in (("inside", inside), ("outside", outside)):
             spots = np.concatenate([np.outer(radii, [np.cos(t), np.sin(t)]) for t in turn[::6]])
-            moved = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
+            u_spots = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
             unit = spots / np.linalg.norm(spots, axis=1, keepdims=True)
-            radial = np.einsum("nd,nd->n", moved[:, :2], unit)
-            got = {"u_z": -moved[:, 2], "u_r": radial, "u_x": moved[:, 0]}
-            exact = covered(radii, a, poisson, sheet_mm, disc) if sheet_mm else bare(radii, a, poisson, disc)
+            radial = np.einsum("nd,nd->n", u_spots[:, :2], unit)
+            computed = {"u_z": -u_spots[:, 2], "u_r": radial, "u_x": u_spots[:, 0]}
+            exact = (
+                solve_covered(radii, a, poisson, sheet_mm, disc)
+                if sheet_mm
+                else solve_bare(radii, a, poisson, disc)
+            )
             setting = {"tets": count, "poisson": poisson, "sheet_mm": sheet_mm, "disc": disc}
             for part, value in exact.items():
-                mean = got[part].reshape(-1, len(radii)).mean(axis=0)
+                mean = computed[part].reshape(-1, len(radii)).mean(axis=0)
                 error = float(np.linalg.norm(mean - value) / np.linalg.norm(value))
                 rows.append(setting | {"part": f"{part} {place}", "error": round(error, 4)})
     return rows
 
 
-def bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
+def solve_bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
     """Displacement of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4 and 3.6).
 
     Under a tangential load the kernel of point forces is [(1 - nu)/s + nu (x/s)^2/s] / (2 pi G). Its square
@@ -76,22 +80,22 @@ def bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
     sideways = -(1 - 2 * poisson) * (1 + poisson)
     if disc == "hertz":
         p = 1.5 / (np.pi * a * a)
-        near = np.pi / (4 * a) * (2 * a * a - r**2)
+        inside = np.pi / (4 * a) * (2 * a * a - r**2)
         reach = np.minimum(a / r, 1)
-        far = ((2 * a * a - r**2) * np.arcsin(reach) + r * a * np.sqrt(1 - reach**2)) / (2 * a)
+        outside = ((2 * a * a - r**2) * np.arcsin(reach) + r * a * np.sqrt(1 - reach**2)) / (2 * a)
         swept = np.where(r < a, 1 - np.clip(1 - (r / a) ** 2, 0, 1) ** 1.5, 1.0)
-        down = (1 - poisson**2) * p * np.where(r < a, near, far)
+        down = (1 - poisson**2) * p * np.where(r < a, inside, outside)
         return {"u_z": down, "u_r": sideways * p * a * a / (3 * r) * swept}
     p = 1 / (np.pi * a * a)
     within = np.where(r < a, np.minimum(r / a, 1), np.minimum(a / r, 1)) ** 2
-    far = r * (ellipe(within) - (1 - within) * ellipk(within))
-    down = 4 * (1 - poisson**2) * p / np.pi * np.where(r < a, a * ellipe(within), far)
+    outside = r * (ellipe(within) - (1 - within) * ellipk(within))
+    down = 4 * (1 - poisson**2) * p / np.pi * np.where(r < a, a * ellipe(within), outside)
     if disc == "tangential":
         return {"u_x": down / (1 - poisson) * (1 - poisson / 2)}
     return {"u_z": down, "u_r": sideways * p / 2 * np.where(r < a, r, a * a / r)}
 
 
-def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> dict[str, Floats]:
+def solve_covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> dict[str, Floats]:
     """Displacement of the surface under a linear membrane of no thickness, by Hankel integrals; E = 1 kPa.
 
     Under a surface load t of wavenumber k the half-space moves by (1 - nu) t / (G k) along the load, normal
@@ -104,46 +108,48 @@ def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> 
         a: radius of the disc, mm.
         poisson: Poisson's ratio of the half-space.
         sheet_mm: S, stiffness of the membrane over Young's modulus of the half-space.
-        disc: as in `bare`.
+        disc: as in `solve_bare`.
 
     Returns:
-        As `bare`.
+        As `solve_bare`.
     """
     shear = 1 / (2 * (1 + poisson))
     k = (np.arange(400_000) + 0.5) * 2e-3 / a
     x = k * a
     load = 3 * (np.sin(x) - x * np.cos(x)) / x**3 if disc == "hertz" else 2 * j1(x) / x
     load = load / (2 * np.pi) * k * (k[1] - k[0])
-    own, cross = (1 - poisson) / (shear * k), (1 - 2 * poisson) / (2 * shear * k)
-    held = 4 / 3 * sheet_mm * k * k
-    straight = np.stack([j0(k * at) for at in r])
+    direct, cross = (1 - poisson) / (shear * k), (1 - 2 * poisson) / (2 * shear * k)
+    sheet = 4 / 3 * sheet_mm * k * k
+    bessel_0 = np.stack([j0(k * radius) for radius in r])
     if disc == "tangential":
         sideways = 1 / (shear * k + sheet_mm / 3 * k * k)
-        return {"u_x": 0.5 * straight @ (load * (own / (1 + own * held) + sideways))}
-    down = own - cross**2 * held / (1 + own * held)
-    out = np.stack([j1(k * at) for at in r]) @ (load * cross / (1 + own * held))
-    return {"u_z": straight @ (load * down), "u_r": -out}
+        return {"u_x": 0.5 * bessel_0 @ (load * (direct / (1 + direct * sheet) + sideways))}
+    down = direct - cross**2 * sheet / (1 + direct * sheet)
+    outward = np.stack([j1(k * radius) for radius in r]) @ (load * cross / (1 + direct * sheet))
+    return {"u_z": bessel_0 @ (load * down), "u_r": -outward}
 
 
-def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson: float) -> Floats:
+def point_loads(
+    points: Floats, positions: Floats, share: Floats, direction: Floats, poisson: float
+) -> Floats:
     """Displacement (N, 3) mm in a half-space z <= 0 under point forces on it (Johnson 3.2, 3.6)."""
     shear = 1 / (2 * (1 + poisson))
-    out = np.zeros_like(points)
-    for place, part in zip(at, share, strict=True):
+    u = np.zeros_like(points)
+    for place, part in zip(positions, share, strict=True):
         x, y, z = points[:, 0] - place[0], points[:, 1] - place[1], -points[:, 2]
         s = np.sqrt(x * x + y * y + z * z)
         k = part / (4 * np.pi * shear)
-        if way[2]:
+        if direction[2]:
             ring = z / s**3 - (1 - 2 * poisson) / (s * (s + z))
-            out += k * np.column_stack([ring * x, ring * y, -(2 * (1 - poisson) / s + z * z / s**3)])
+            u += k * np.column_stack([ring * x, ring * y, -(2 * (1 - poisson) / s + z * z / s**3)])
         else:
             side = 1 - 2 * poisson
-            deep = s + z
-            out += k * np.column_stack(
+            depth_sum = s + z
+            u += k * np.column_stack(
                 [
-                    1 / s + x * x / s**3 + side * (1 / deep - x * x / (s * deep**2)),
-                    x * y / s**3 - side * x * y / (s * deep**2),
-                    -(x * z / s**3 + side * x / (s * deep)),
+                    1 / s + x * x / s**3 + side * (1 / depth_sum - x * x / (s * depth_sum**2)),
+                    x * y / s**3 - side * x * y / (s * depth_sum**2),
+                    -(x * z / s**3 + side * x / (s * depth_sum)),
                 ]
             )
-    return out
+    return u

@@ -14,11 +14,11 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     base = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # of the run, not of this process
-    folder, done = base / name, base / f"{name}.done"
+    folder, marker = base / name, base / f"{name}.done"
     with FileLock(base / f"{name}.lock"):
-        if not done.exists():
+        if not marker.exists():
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             make(folder)
-            done.touch()
+            marker.touch()
     return folder

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.optimize import newton_krylov
 from scipy.sparse.linalg import LinearOperator
 
-from synth.fem.equilibrium import on_free
+from synth.fem.equilibrium import mask_fixed
 from synth.fem.system import System
 
 Floats = NDArray[np.float64]
@@ -18,12 +18,12 @@ def newton(system: System, load: Floats, start: Floats, tolerance: float = 1e-8)
     NoConvergence if it is not reached.
     """
     size = max(np.abs(load).max(), np.abs(system.state(start).force).max())
-    found = newton_krylov(
-        lambda u: on_free(system, system.state(u).force - load),
+    solution = newton_krylov(
+        lambda u: mask_fixed(system, system.state(u).force - load),
         start,
         method="gmres",
         inner_M=LinearOperator((start.size,) * 2, lambda f: system.solve(f.reshape(-1, 3)).ravel()),
         f_tol=tolerance * size,
         maxiter=60,
     )
-    return np.asarray(found)
+    return np.asarray(solution)

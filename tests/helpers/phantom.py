@@ -63,14 +63,14 @@ def write(
     )
     rows, cols = SIZE
     young = float(np.exp(rng.uniform(np.log(0.5), np.log(3.0))))
-    at = rng.uniform(-4, 4, 2)
+    contact = rng.uniform(-4, 4, 2)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     peak = rng.uniform(0.02, 0.12) * young * RADIUS_MM**2 * direction
-    x = (np.arange(cols) - (cols - 1) / 2) * SCALE_MM_PER_PX - at[0]
-    y = (np.arange(rows) - (rows - 1) / 2) * SCALE_MM_PER_PX - at[1]
+    x = (np.arange(cols) - (cols - 1) / 2) * SCALE_MM_PER_PX - contact[0]
+    y = (np.arange(rows) - (rows - 1) / 2) * SCALE_MM_PER_PX - contact[1]
     gx, gy = np.meshgrid(x, y)
-    tissue = (gx + at[0]) ** 2 + (gy + at[1]) ** 2 < 11.0**2
+    tissue = (gx + contact[0]) ** 2 + (gy + contact[1]) ** 2 < 11.0**2
     area = np.full(SIZE, SCALE_MM_PER_PX**2, np.float32)
     ramp = np.sin(np.linspace(0, np.pi, frames)).clip(0)
     writer = Writer(folder, index, frames=frames, size=SIZE, job=job)
@@ -99,8 +99,8 @@ def write(
             depth = depth_motion(gx, gy, level * peak, young)[..., None] * tissue[..., None]
             motion = np.concatenate([flow * SCALE_MM_PER_PX, depth], axis=-1)
             writer.put_frame("motion", t, motion.astype(np.float32))
-            off = 0.02 * rng.normal(size=motion.shape) * tissue[..., None]
-            writer.put_frame("motion_recovered", t, (motion + off).astype(np.float32))
+            noise = 0.02 * rng.normal(size=motion.shape) * tissue[..., None]
+            writer.put_frame("motion_recovered", t, (motion + noise).astype(np.float32))
             spread = np.array([0.02, 0.02, 0.04], np.float32) * tissue[..., None]
             writer.put_frame("motion_deviation", t, spread.astype(np.float32))
             writer.put_frame("rgb_right", t, np.roll(picture, t, axis=1))

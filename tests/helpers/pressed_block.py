@@ -65,35 +65,41 @@ def write(folder: Path, form: str, mm: float = 1.0, mn: float = 1.0, spacing_mm:
     folder.mkdir(exist_ok=True, parents=True)
     rest, u, force = block.points / mm, block.u / mm, block.force / mn
     times = STEP_S * np.arange(STATES)
-    moved, borne = (np.multiply.outer(block.scale, one) for one in (u, force))
+    displacement, loads = (np.multiply.outer(block.scale, field) for field in (u, force))
     if form in ("npz", "points"):
-        motion = {"rest": rest, "displacement": moved} if form == "npz" else {"points": rest + moved}
-        np.savez(folder / "s.npz", **motion, contact=borne, times=times, tetrahedra=block.tets)
+        motion = (
+            {"rest": rest, "displacement": displacement} if form == "npz" else {"points": rest + displacement}
+        )
+        np.savez(folder / "s.npz", **motion, contact=loads, times=times, tetrahedra=block.tets)
         return folder / "s.npz"
     if form == "recorder":
         top = np.unique(np.flatnonzero(np.isclose(rest[:, 2], 0)))
         faces = meshio.Mesh(rest, [("tetra", block.tets)])
-        outer = [one for one in _faces(faces.cells[0].data) if set(one) <= set(top.tolist())]
+        outer = [face for face in _faces(faces.cells[0].data) if set(face) <= set(top.tolist())]
         order = {node: k for k, node in enumerate(top.tolist())}
         lines = [f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in rest[top]]
         lines += [f"f {order[a] + 1} {order[b] + 1} {order[c] + 1}\n" for a, b, c in outer]
         (folder / "surface.obj").write_text("".join(lines))
-        size, total = np.linalg.norm(borne, axis=2).max(axis=1), np.linalg.norm(borne.sum(axis=1), axis=1)
-        intensity = borne * (total / np.maximum(size, 1e-12))[:, None, None] / 1000
-        arrays = {"rest": rest[top], "frames": rest[top] + moved[:, top], "displacements": moved[:, top]}
+        size, total = np.linalg.norm(loads, axis=2).max(axis=1), np.linalg.norm(loads.sum(axis=1), axis=1)
+        intensity = loads * (total / np.maximum(size, 1e-12))[:, None, None] / 1000
+        arrays = {
+            "rest": rest[top],
+            "frames": rest[top] + displacement[:, top],
+            "displacements": displacement[:, top],
+        }
         arrays |= {"times": times, "surface_external_forces": intensity[:, top]}
         np.savez(folder / "brain_surface_0a_final.npz", **arrays)
         (folder / "brain_surface_0a_meta.json").write_text(json.dumps({"E": YOUNG_KPA}))
         return folder
     names = []
     for k in range(STATES):
-        at = rest + moved[k] if form == "moving" else rest
-        fields = {"contact": borne[k]} | ({} if form == "moving" else {"displacement": moved[k]})
+        points = rest + displacement[k] if form == "moving" else rest
+        fields = {"contact": loads[k]} | ({} if form == "moving" else {"displacement": displacement[k]})
         names.append(f"block_{k}.{'vtk' if form == 'vtk' else 'vtu'}")
         if form in ("ascii", "moving"):
-            (folder / names[-1]).write_text(ascii_vtu(at, block.tets, fields))
+            (folder / names[-1]).write_text(ascii_vtu(points, block.tets, fields))
         else:
-            mesh = meshio.Mesh(at, [("tetra", block.tets)], point_data=fields)
+            mesh = meshio.Mesh(points, [("tetra", block.tets)], point_data=fields)
             mesh.write(folder / names[-1], file_format="vtk42" if form == "vtk" else "vtu")
     if form == "binary":
         sets = "".join(f'<DataSet timestep="{t}" file="{n}"/>' for t, n in zip(times, names, strict=True))
@@ -112,7 +118,7 @@ def ascii_vtu(points: Floats, tets: Ints, fields: dict[str, Floats]) -> str:
 
     def array(name: str, values: np.ndarray, kind: str) -> str:
         parts = values.shape[1] if values.ndim == 2 else 1
-        text = " ".join(f"{one:.9g}" for one in values.ravel().tolist())
+        text = " ".join(f"{value:.9g}" for value in values.ravel().tolist())
         about = f'type="{kind}" Name="{name}" NumberOfComponents="{parts}" format="ascii"'
         return f"<DataArray {about}>{text}</DataArray>"
 
@@ -121,7 +127,7 @@ def ascii_vtu(points: Floats, tets: Ints, fields: dict[str, Floats]) -> str:
         "offsets", 4 * np.arange(1, count + 1), "Int32"
     )
     cells += array("types", np.full(count, 10), "UInt8")
-    data = "".join(array(name, one, "Float64") for name, one in fields.items())
+    data = "".join(array(name, values, "Float64") for name, values in fields.items())
     return (
         '<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="0.1" byte_order="BigEndian">'
         f'<UnstructuredGrid><Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">'
@@ -132,6 +138,8 @@ def ascii_vtu(points: Floats, tets: Ints, fields: dict[str, Floats]) -> str:
 
 def _faces(tets: Ints) -> list[tuple[int, ...]]:
     """Corners of the faces of all tetrahedra that only one has."""
-    every = np.concatenate([tets[:, list(one)] for one in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))])
-    _, first, count = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_counts=True)
-    return [tuple(one) for one in every[first[count == 1]].tolist()]
+    all_faces = np.concatenate(
+        [tets[:, list(corners)] for corners in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))]
+    )
+    _, first, count = np.unique(np.sort(all_faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return [tuple(face) for face in all_faces[first[count == 1]].tolist()]

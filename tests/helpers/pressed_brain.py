@@ -13,7 +13,7 @@ from synth.geometry.triangles import grid_faces
 from synth.job import schema
 
 ANATOMY = schema.AnatomySection()
-WAYS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
+DIRECTIONS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
 CONTACTS = ((0.0, 0.0, 4.5), (5.0, 2.0, 3.0), (-3.0, -5.0, 6.0), (-2.0, 6.0, 3.5))
 """x, y and radius, mm, world axes: the default range of radii, near the centre and near the rim."""
 
@@ -34,9 +34,9 @@ def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:
     x = np.linspace(-extent / 2, extent / 2, n)
     xy = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     faces = np.concatenate(grid_faces(n, n))
-    at = np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)])
+    points = np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)])
     inside = np.hypot(*xy.T) < ANATOMY.craniotomy.radius_mm
-    return Patch(at, faces, surface_embedding.vertex_area(at, faces), inside)
+    return Patch(points, faces, surface_embedding.vertex_area(points, faces), inside)
 
 
 @dataclass(frozen=True)
@@ -48,27 +48,31 @@ class Brain:
     kernel: Floats  # (V,) share of a unit force at every vertex
     radius_mm: float
 
-    def load(self, load: float, way: str) -> Floats:
+    def load(self, load: float, direction: str) -> Floats:
         """(N, 3) mN for E = 1 kPa at P = `load`."""
-        return self.embedding.gather(np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way])))
+        return self.embedding.gather(
+            np.outer(self.kernel, load * self.radius_mm**2 * np.array(DIRECTIONS[direction]))
+        )
 
 
-def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4) -> Brain:
+def brain(
+    surface: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4
+) -> Brain:
     """Mesh, equations and embedded surface of one contact."""
     volume = tetrahedra.block(tets, (contact,))
-    embedding = surface_embedding.embed(volume, on.vertices)
-    pressure = tool_gesture.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
+    embedding = surface_embedding.embed(volume, surface.vertices)
+    pressure = tool_gesture.footprint(np.array(contact[:2]), contact[2], surface.vertices, surface.area)
     system = assemble(volume, law, poisson)
-    return Brain(system, embedding, on.area * pressure, contact[2])
+    return Brain(system, embedding, surface.area * pressure, contact[2])
 
 
-def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
+def solve_displacement(case: Brain, load: float, direction: str, steps: int = 3) -> Floats:
     """Displacement (V, 3) mm under a load that is raised in a few steps."""
     part = np.linspace(0, 1, steps + 1)
-    path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, way), load * part)
+    path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, direction), load * part)
     return case.embedding.move(path.displacement[-1])
 
 
-def error(u: Floats, exact: Floats, on: Patch) -> float:
+def error(u: Floats, exact: Floats, surface: Patch) -> float:
     """Relative root mean square over the opening."""
-    return float(np.linalg.norm((u - exact)[on.opening]) / np.linalg.norm(exact[on.opening]))
+    return float(np.linalg.norm((u - exact)[surface.opening]) / np.linalg.norm(exact[surface.opening]))

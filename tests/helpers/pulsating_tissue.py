@@ -34,25 +34,25 @@ def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[st
     place, steps = rng.uniform(-3, 3, 2), np.arange(-_CONTACT_MM, _CONTACT_MM + 0.1, 0.8)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     share = np.clip(1 - (x**2 + y**2) / _CONTACT_MM**2, 0, None) ** 2
-    held = block.embed(np.column_stack([x, y])[share > 0] + place)
+    contact = block.embed(np.column_stack([x, y])[share > 0] + place)
     direction = rng.normal(size=3) * [1.0, 1.0, 0.5]
     direction /= np.linalg.norm(direction)
-    load = held.gather(np.outer(share[share > 0] / share.sum(), TO_CAMERA.T @ direction))
+    load = contact.gather(np.outer(share[share > 0] / share.sum(), TO_CAMERA.T @ direction))
     coarse = np.linspace(-_RADIUS_MM - 1, _RADIUS_MM + 1, 41)
-    at = np.column_stack([axis.ravel() for axis in np.meshgrid(coarse, coarse)])
-    moved = picture(block.embed(at), block.system.solve(load)).reshape(41, 41, 2) / YOUNG_KPA
-    where = ((np.arange(size) - (size - 1) / 2) * mm_per_px + _RADIUS_MM + 1) / (coarse[1] - coarse[0])
-    across, down = np.meshgrid(where.astype(np.float32), where.astype(np.float32))
-    field = cv2.remap(moved.astype(np.float32), across, down, cv2.INTER_CUBIC) / mm_per_px
+    points = np.column_stack([axis.ravel() for axis in np.meshgrid(coarse, coarse)])
+    displacement = picture(block.embed(points), block.system.solve(load)).reshape(41, 41, 2) / YOUNG_KPA
+    positions = ((np.arange(size) - (size - 1) / 2) * mm_per_px + _RADIUS_MM + 1) / (coarse[1] - coarse[0])
+    across, down = np.meshgrid(positions.astype(np.float32), positions.astype(np.float32))
+    field = cv2.remap(displacement.astype(np.float32), across, down, cv2.INTER_CUBIC) / mm_per_px
     time_s = np.arange(0, seconds, 1 / _FPS)
     force, begin = np.zeros(len(time_s)), 2.0
     while begin < seconds - 3:
-        long, peak = rng.uniform(1.0, 2.5), rng.uniform(15, 40)
-        inside = (time_s > begin) & (time_s < begin + long)
-        force += inside * peak * np.sin(np.pi * (time_s - begin) / long) ** 2
-        begin += long + rng.uniform(0.8, 2.0)
-    found = {"time_s": time_s, "force_mn": force[:, None] * direction, "field": field}
-    return found | {"mm_per_px": mm_per_px, "phase": rng.uniform(0, 2 * np.pi, 2)}
+        duration_s, peak = rng.uniform(1.0, 2.5), rng.uniform(15, 40)
+        inside = (time_s > begin) & (time_s < begin + duration_s)
+        force += inside * peak * np.sin(np.pi * (time_s - begin) / duration_s) ** 2
+        begin += duration_s + rng.uniform(0.8, 2.0)
+    curves = {"time_s": time_s, "force_mn": force[:, None] * direction, "field": field}
+    return curves | {"mm_per_px": mm_per_px, "phase": rng.uniform(0, 2 * np.pi, 2)}
 
 
 def pulse_motion(time_s: float, phase: Floats, size: int) -> Floats:
@@ -79,15 +79,15 @@ def record(
     times, force = contact["time_s"], contact["force_mn"]
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
     for k, time in enumerate(times):
-        moved = float(np.linalg.norm(force[k])) * contact["field"]
-        own = pulse_motion(time, contact["phase"], size)
-        own = own - pulse_motion(float(times[0]), contact["phase"], size)
-        moved = moved + pulse * own / contact["mm_per_px"]
-        source = inverse(moved.astype(np.float32))
+        displacement = float(np.linalg.norm(force[k])) * contact["field"]
+        pulse_shift = pulse_motion(time, contact["phase"], size)
+        pulse_shift = pulse_shift - pulse_motion(float(times[0]), contact["phase"], size)
+        displacement = displacement + pulse * pulse_shift / contact["mm_per_px"]
+        source = inverse(displacement.astype(np.float32))
         rgb = cv2.remap(rest, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         rgb[~inside] = 90  # moving surroundings would indicate a moving camera
-        noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
-        cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
+        picture_8bit = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), picture_8bit[..., ::-1])
     cv2.imwrite(str(folder / "tissue.png"), inside.astype(np.uint8) * 255)
     (folder / "masks").mkdir()  # no instrument in view
     cv2.imwrite(str(folder / "masks" / "000000.png"), np.zeros((size, size), np.uint8))
@@ -100,7 +100,7 @@ def record(
 
 def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     """Scores of all frames of the recording."""
-    opened = open_recording(folder)
-    scale = opened.scale
+    recording = open_recording(folder)
+    scale = recording.scale
     settings = RecordingFlowSettings(backend, shrink=1, rate_hz=None)
-    return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})
+    return evaluate_recording(recording, methods, next(iter(methods)), scale, settings, {})

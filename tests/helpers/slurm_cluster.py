@@ -43,17 +43,17 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 def missing() -> str:
     """Why there can be none here; empty if there can."""
-    gone = [name for name in PROGRAMS if shutil.which(name) is None]
-    if gone:
-        return f"no {', '.join(gone)} here (Debian: apt-get install slurm-wlm)"
+    absent = [name for name in PROGRAMS if shutil.which(name) is None]
+    if absent:
+        return f"no {', '.join(absent)} here (Debian: apt-get install slurm-wlm)"
     return "" if os.geteuid() == 0 else "a node's daemon needs root"
 
 
 def call(*words: str) -> str:
     """Output of one of SLURM's commands."""
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
-    return done.stdout.strip()
+    result = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, f"{' '.join(words)}: {result.stderr}"
+    return result.stdout.strip()
 
 
 @contextmanager
@@ -62,14 +62,14 @@ def slurm_cluster(home: Path) -> Iterator[str]:
     host = socket.gethostname().split(".")[0]
     for name in ("state", "spool"):
         (home / name).mkdir(parents=True)
-    with socket.socket() as one, socket.socket() as other:
-        for free in (one, other):
+    with socket.socket() as first, socket.socket() as second:
+        for free in (first, second):
             free.bind(("127.0.0.1", 0))
-        ports = {"controller": one.getsockname()[1], "daemon": other.getsockname()[1]}
+        ports = {"controller": first.getsockname()[1], "daemon": second.getsockname()[1]}
     (home / "slurm.conf").write_text(_CONFIGURATION.format(home=home, host=host, **ports))
     daemons: list[subprocess.Popen[bytes]] = []
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("SLURM_CONF", str(home / "slurm.conf"))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("SLURM_CONF", str(home / "slurm.conf"))
         try:
             for program in ("slurmctld", "slurmd"):
                 log = (home / f"{program}.out").open("wb")
@@ -93,8 +93,8 @@ def _wait_for_node(daemons: list[subprocess.Popen[bytes]], home: Path) -> None:
     while time.monotonic() < until:
         logs = "\n".join(path.read_text(errors="replace") for path in home.glob("*.out"))
         assert all(daemon.poll() is None for daemon in daemons), logs
-        done = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=60)
-        if done.stdout.strip() == "idle":
+        result = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=60)
+        if result.stdout.strip() == "idle":
             return
         time.sleep(0.5)
     raise AssertionError(f"the node never came up\n{logs}")

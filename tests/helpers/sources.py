@@ -10,23 +10,23 @@ PACKAGES = ("synth", "learn", "bench", "evidence", "weights")
 
 
 def sources(*packages: str) -> list[Path]:
-    found = sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
-    assert len(found) > len(packages)
-    return found
+    paths = sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+    assert len(paths) > len(packages)
+    return paths
 
 
 @cache
-def parsed(path: Path) -> ast.Module:
+def parse(path: Path) -> ast.Module:
     """A file's syntax tree; to be read, not changed."""
     return ast.parse(path.read_text("utf-8"))
 
 
 @cache
 def imports(path: Path) -> tuple[str, ...]:
-    return tuple(imported(parsed(path)))
+    return tuple(list_imports(parse(path)))
 
 
-def imported(tree: ast.Module) -> Iterator[str]:
+def list_imports(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -98,10 +98,10 @@ def pull_field(recipe: Recipe) -> Map:
     dimple = recipe.reach * recipe.size
     rim = np.clip((0.5 * recipe.size - np.hypot(x - x.mean(), y - y.mean())) / (0.2 * recipe.size), 0, 1)
     hold = rim**2 * (3 - 2 * rim)
-    along = hold / np.sqrt(1 + (radius / dimple) ** 2)
+    pull = hold / np.sqrt(1 + (radius / dimple) ** 2)
     pinch = -0.25 * hold * np.exp(-((radius / (1.3 * dimple)) ** 2)) / dimple
-    u = along * np.cos(recipe.direction) + pinch * dx
-    v = along * np.sin(recipe.direction) + pinch * dy
+    u = pull * np.cos(recipe.direction) + pinch * dx
+    v = pull * np.sin(recipe.direction) + pinch * dy
     return np.asarray(np.stack([u, v], -1) * (recipe.pull / np.hypot(u, v).max()), np.float32)
 
 
@@ -123,40 +123,40 @@ def inverse(flow: Map) -> Map:
 
 def inside(flow: Map) -> Mask:
     """Pixels (H, W) of the rest frame that stay in the image under a flow (H, W, 2) px."""
-    at = pixels(*flow.shape[:2]) + flow
-    return np.asarray(np.all((at >= 0) & (at <= np.array(flow.shape[1::-1]) - 1), axis=-1))
+    points = pixels(*flow.shape[:2]) + flow
+    return np.asarray(np.all((points >= 0) & (points <= np.array(flow.shape[1::-1]) - 1), axis=-1))
 
 
 def at_rest(mask: Mask, flow: Map) -> Map:
     """A mask (H, W) of the current frame on the rest frame's pixels, 0..1, by a flow (H, W, 2) px."""
-    at = pixels(*mask.shape) + flow
-    return np.asarray(cv2.remap(mask.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR))
+    points = pixels(*mask.shape) + flow
+    return np.asarray(cv2.remap(mask.astype(np.float32), points[..., 0], points[..., 1], cv2.INTER_LINEAR))
 
 
-def dilated(mask: Mask, side: int) -> Mask:
+def dilate(mask: Mask, side: int) -> Mask:
     """A mask (H, W) dilated by a square of `side` px."""
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def sensed(picture: Map, noise: float, rng: np.random.Generator) -> Pixels:
+def add_noise(picture: Map, noise: float, rng: np.random.Generator) -> Pixels:
     """A picture of 0..255 with Gaussian noise of a standard deviation [grey levels]."""
     return np.clip(np.round(picture + rng.normal(0, noise, picture.shape)), 0, 255).astype(np.uint8)
 
 
-def resampled(picture: Map, at: Map) -> Map:
+def resample(picture: Map, points: Map) -> Map:
     """A picture (2H, 2W, 3), two samples a pixel, at places (..., 2) px by cubic splines: (..., 3)."""
-    where = (at + 0.5) * _FINE - 0.5
-    return np.stack([sample(picture[..., c], where) for c in range(3)], -1)
+    samples = (points + 0.5) * _FINE - 0.5
+    return np.stack([sample(picture[..., c], samples) for c in range(3)], -1)
 
 
-def sample(field: Map, where: Map, order: int = 3) -> Map:
+def sample(field: Map, points: Map, order: int = 3) -> Map:
     """Field (H, W) at points (x, y), (..., 2), by cubic splines.
 
     OpenCV's remap rounds to 1/32 px and its bicubic kernel displaces a ramp by up to 0.05 px: too much for a
     ground truth.
     """
     return np.asarray(
-        map_coordinates(field, (where[..., 1], where[..., 0]), order=order, mode="mirror"), np.float32
+        map_coordinates(field, (points[..., 1], points[..., 0]), order=order, mode="mirror"), np.float32
     )
 
 
@@ -183,8 +183,8 @@ class Stage:
     def rest(self, rng: np.random.Generator) -> tuple[Pixels, Mask]:
         """The rest frame and its highlights: (H, W, 3) uint8, (H, W) bool."""
         grid = pixels(self.recipe.size, self.recipe.size)
-        picture, glare = self._light(resampled(self.albedo, grid), self.wet, 0.0)
-        return sensed(255 * picture, self.recipe.noise, rng), glare
+        picture, glare = self._light(resample(self.albedo, grid), self.wet, 0.0)
+        return add_noise(255 * picture, self.recipe.noise, rng), glare
 
     def against(self, rest: tuple[Pixels, Mask], share: float, rng: np.random.Generator) -> Pair:
         """The rest frame and the frame at `share` of the full pull."""
@@ -193,7 +193,7 @@ class Stage:
         source = inverse(flow)
         # Highlights depend on light and slope: they stay nearly in place as the surface moves.
         picture, glare = self._light(
-            resampled(self.albedo, source), self.wet + 0.5 * share * self.drift, share
+            resample(self.albedo, source), self.wet + 0.5 * share * self.drift, share
         )
         if recipe.blur > 0:
             picture = cv2.GaussianBlur(picture, (0, 0), recipe.blur)
@@ -201,17 +201,17 @@ class Stage:
         picture = np.where(tool[..., None], _metal(picture.shape[:2]), picture)
         soft = cv2.GaussianBlur(tool.astype(np.float32), (0, 0), 0.6)[..., None]
         picture = picture + np.where(tool[..., None], 0, soft * (0.1 - picture))
-        tool, there = dilated(tool, 3), inside(flow)
+        tool, in_view = dilate(tool, 3), inside(flow)
         length = np.hypot(self.field[..., 0], self.field[..., 1])
         return Pair(
             rest=rest[0],
-            now=sensed(255 * picture, recipe.noise, rng),
+            now=add_noise(255 * picture, recipe.noise, rng),
             flow=flow,
             rest_usable=~rest[1],
             now_usable=~(tool | glare),
-            hidden=(at_rest(tool, flow) > 0.5) & there,
-            contact=(length > 0.7 * length.max()) & there,
-            inside=there,
+            hidden=(at_rest(tool, flow) > 0.5) & in_view,
+            contact=(length > 0.7 * length.max()) & in_view,
+            inside=in_view,
         )
 
     def _light(self, albedo: Map, wet: Map, share: float) -> tuple[Map, Mask]:
@@ -235,9 +235,9 @@ class Stage:
         tip = np.array([middle[1], middle[0]], float) + share * self.field[middle]
         for angle, side in ((0.35, -1), (0.75, 1)):
             normal = np.array([-np.sin(angle), np.cos(angle)])
-            along = np.array([np.cos(angle), np.sin(angle)])
+            axis = np.array([np.cos(angle), np.sin(angle)])
             start = tip + 0.35 * side * recipe.tool * normal
-            end = start + 2 * recipe.size * along
+            end = start + 2 * recipe.size * axis
             sharp = 0.5 * recipe.tool * normal
             outline = np.array([start - 0.5 * sharp, start + 0.5 * sharp, end + sharp, end - sharp])
             cv2.fillConvexPoly(mask, np.round(outline * 16).astype(np.int32), 1, shift=4)
@@ -247,8 +247,8 @@ class Stage:
 def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:
     """`count` independent pairs with different surfaces and directions of pull."""
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)):
-        turned = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
-        stage = Stage.set(turned, rng)
+        variant = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
+        stage = Stage.set(variant, rng)
         yield stage.against(stage.rest(rng), 1.0, rng)
 
 

@@ -42,11 +42,11 @@ def damage(file: Path) -> None:
 
 def test_an_edited_or_invalid_card_is_refused_in_one_line(model: Path, pristine: Path) -> None:
     file, card = model / "config.json", read_card(model)
-    edited = file.read_text().replace('"typical_young_kpa": 1.7', '"typical_young_kpa": 17')
+    edited_text = file.read_text().replace('"typical_young_kpa": 1.7', '"typical_young_kpa": 17')
     write_card(model, replace(card, scales=replace(card.scales, displacement_mm=0.0)))
-    for wrong, named in ((file.read_text(), r"scales\.displacement_mm"), ("[]", ""), (edited, "")):
-        file.write_text(wrong)
-        with pytest.raises(UserError, match=rf"config\.json.*{named}"):
+    for text, match in ((file.read_text(), r"scales\.displacement_mm"), ("[]", ""), (edited_text, "")):
+        file.write_text(text)
+        with pytest.raises(UserError, match=rf"config\.json.*{match}"):
             read_model(model)
     assert run(app, "calibrate", model, pristine / "000000.zarr", code=2).stderr.count("\n") == 1
 
@@ -64,8 +64,8 @@ def test_a_flipped_bit_of_weights_and_of_a_state_of_training_is_found(model: Pat
 
 
 def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored = safetensors.torch.load_file(model / "weights.safetensors")
-    state = {name: value * 2 for name, value in stored.items()}
+    initial = safetensors.torch.load_file(model / "weights.safetensors")
+    state = {name: value * 2 for name, value in initial.items()}
     card = read_card(model)
     for dies_at in ("write_card", "os.replace"):
         before = {name: value.clone() for name, value in read_model(model)[0].state_dict().items()}
@@ -76,9 +76,9 @@ def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch
                 patch.setattr("learn.checkpoint._write", lambda file, data: file.write_bytes(data))
             with pytest.raises(KeyboardInterrupt):
                 write_model(model, card, state)
-        there = read_model(model)[0].state_dict()
+        weights = read_model(model)[0].state_dict()
         expected = before if dies_at == "write_card" else state
-        assert all(torch.equal(there[name], value) for name, value in expected.items())
+        assert all(torch.equal(weights[name], value) for name, value in expected.items())
 
 
 class Code:
@@ -91,8 +91,8 @@ class Code:
 def replace_weights(model: Path, data: bytes) -> None:
     """Other weights, with a card that has their hash."""
     (model / "weights.safetensors").write_bytes(data)
-    found = hashlib.blake2b(data, digest_size=16).hexdigest()
-    write_card(model, replace(read_card(model), weights_hash=found))
+    weights_hash = hashlib.blake2b(data, digest_size=16).hexdigest()
+    write_card(model, replace(read_card(model), weights_hash=weights_hash))
 
 
 def test_files_that_are_no_weights_are_refused(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +104,7 @@ def test_files_that_are_no_weights_are_refused(model: Path, monkeypatch: pytest.
     torch.save({"x": Code()}, "last.pt")
     replace_weights(model, Path("last.pt").read_bytes())
     for read, file in ((read_model, model), (read_tensors, model / "last.pt")):
-        with pytest.raises(UserError) as refused:
+        with pytest.raises(UserError) as caught:
             read(file)
-        assert "weights_only" not in str(refused.value)  # PyTorch's advice to run the code
+        assert "weights_only" not in str(caught.value)  # PyTorch's advice to run the code
     assert not Path("ran").exists()

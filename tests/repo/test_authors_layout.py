@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 from command import run
-from fake_recording import scored
+from fake_recording import score_recording
 from igs_sequence import write_igs
 
 from bench.cli import app
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 def test_scores_equal_those_from_the_dataset(out: Path, tmp_path: Path) -> None:
     """Pictures without loss in a video beside a sequence without pixels; force in newtons, of six numbers."""
     sequence = Dataset(out)[0]
-    direct = export_recording(sequence, tmp_path / "direct")
+    original = export_recording(sequence, tmp_path / "direct")
     source = tmp_path / "authors"
     source.mkdir()
     with av.open(str(source / "a.mkv"), "w") as film:
@@ -32,12 +32,12 @@ def test_scores_equal_those_from_the_dataset(out: Path, tmp_path: Path) -> None:
         film.mux(stream.encode(None))
     times, force_n = np.asarray(sequence["time"][:], float), np.asarray(sequence["force"][:], float) / 1000
     write_igs(source / "a.igs.mha", times, force_n, "a.mkv")
-    imported = tmp_path / "imported"
-    run(app, "import", source / "a.igs.mha", "-o", imported, "--scale", sequence.attrs["scale_mm_per_px"])
+    recording = tmp_path / "imported"
+    run(app, "import", source / "a.igs.mha", "-o", recording, "--scale", sequence.attrs["scale_mm_per_px"])
     for name in ("meta.yaml", "tissue.png"):  # what a sequence can't state
-        shutil.copy(direct / name, imported / name)
-    shutil.copytree(direct / "masks", imported / "masks", dirs_exist_ok=True)
-    first, second = (scored(folder) for folder in (direct, imported))
+        shutil.copy(original / name, recording / name)
+    shutil.copytree(original / "masks", recording / "masks", dirs_exist_ok=True)
+    first, second = (score_recording(folder) for folder in (original, recording))
     np.testing.assert_allclose(second.time_s, first.time_s, atol=1e-5)
     np.testing.assert_allclose(second.sensor_mn, first.sensor_mn, atol=2e-3)  # written to 1e-6 N
     np.testing.assert_allclose(second.methods["bump"].size_mn, first.methods["bump"].size_mn, rtol=1e-6)

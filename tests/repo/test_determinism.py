@@ -2,13 +2,13 @@
 
 import ast
 
-from sources import PACKAGES, ROOT, imports, parsed, sources
+from sources import PACKAGES, ROOT, imports, parse, sources
 
 
 def test_no_global_generator_and_none_without_a_seed_in_synth() -> None:
     for path in sources("synth"):
         assert "random" not in imports(path), path
-        for node in ast.walk(parsed(path)):
+        for node in ast.walk(parse(path)):
             if isinstance(node, ast.Attribute):  # of NumPy's, ruff's NPY002 finds them
                 assert ast.unparse(node) not in ("torch.rand", "torch.randn", "torch.manual_seed"), path
             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("default_rng"):

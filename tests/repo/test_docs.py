@@ -38,9 +38,9 @@ OURS = re.compile(rf"(?<![\w./@-])(?:{_TOP})/[\w/]+(?:-\w+)*(?:\.[a-z0-9]+)*")
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
     """Fenced blocks of a language: title and text."""
-    for found in re.finditer(rf"^```{language}(.*?)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
-        title = re.search(r'title="(.*?)"', found[1])
-        yield title[1] if title else "", found[2]
+    for match in re.finditer(rf"^```{language}(.*?)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+        title = re.search(r'title="(.*?)"', match[1])
+        yield title[1] if title else "", match[2]
 
 
 @pytest.fixture(scope="module")
@@ -86,11 +86,11 @@ def test_every_command_has_help_and_examples_that_parse(
         assert all(param.help for param in command.click.params), f"{words}: a parameter has no help"
         assert command.examples or command.group, f'{words} has no example: epilog="Example: ..."'
         for line in command.examples:
-            typed = shlex.split(line)
-            assert tuple(typed[: len(words)]) == words
-            end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
+            line_words = shlex.split(line)
+            assert tuple(line_words[: len(words)]) == words
+            end = next((k for k, word in enumerate(line_words) if word in (">", "|")), len(line_words))
             if not command.group:
-                command.click.make_context(words[-1], typed[len(words) : end])
+                command.click.make_context(words[-1], line_words[len(words) : end])
 
 
 def test_the_help_of_a_job_names_every_job(commands: dict[tuple[str, ...], generate.Command]) -> None:
@@ -111,11 +111,11 @@ def test_figures_of_the_readme_are_those_of_stored_results() -> None:
     text = (ROOT / "README.md").read_text("utf-8")
     rows = re.findall(r"^\| .*\[(.*)\]\((docs/results/.*)README.md\) \| (.*) \|$", text, re.M)
     assert len(rows) == 4
-    for what, folder, shown in rows:
-        found = json.loads((ROOT / folder / "pool.json").read_text("utf-8"))["methods"]
-        key = {"every frame": "mae_of_peak", "peaks": "peak_mae"}[what]
-        stored = [found[name]["scores"][key]["mean"] if name in found else None for name in METHODS]
-        assert shown.split(" | ") == ["–" if value is None else f"{value:.1%}" for value in stored]
+    for row_name, folder, cells in rows:
+        methods = json.loads((ROOT / folder / "pool.json").read_text("utf-8"))["methods"]
+        key = {"every frame": "mae_of_peak", "peaks": "peak_mae"}[row_name]
+        values = [methods[name]["scores"][key]["mean"] if name in methods else None for name in METHODS]
+        assert cells.split(" | ") == ["–" if value is None else f"{value:.1%}" for value in values]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -125,12 +125,12 @@ def test_percentages_in_a_sentence_that_links_to_a_result_are_on_its_page(page: 
         links = re.findall(r"\]\(([^)#]*results/[^)#]*\.md)\)", part)
         if not links:
             continue
-        linked = " ".join((page.parent / one).read_text("utf-8") for one in links)
-        numbers = set(re.findall(r"\d+(?:\.\d+)?", linked))
-        for shown in re.findall(r"\d+(?:\.\d+)?(?=%)", re.sub(r"\([^)]*\)", "", part)):
-            digits = len(shown.partition(".")[2])
-            shares = {f"{100 * float(one):.{digits}f}" for one in numbers if "." in one}
-            assert shown in numbers | shares, f"{page.name}: {shown}% is not in {links}"
+        linked_text = " ".join((page.parent / link).read_text("utf-8") for link in links)
+        numbers = set(re.findall(r"\d+(?:\.\d+)?", linked_text))
+        for percentage in re.findall(r"\d+(?:\.\d+)?(?=%)", re.sub(r"\([^)]*\)", "", part)):
+            digits = len(percentage.partition(".")[2])
+            shares = {f"{100 * float(number):.{digits}f}" for number in numbers if "." in number}
+            assert percentage in numbers | shares, f"{page.name}: {percentage}% is not in {links}"
 
 
 HOWTO = ("instruments", "mechanics", "export", "camera", "models", *PLUG_INS)
@@ -175,8 +175,8 @@ for script in scripts:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(one, marks=[pytest.mark.trial] * (Path(one).name in LONG))
-        for one in ("README", "docs/tutorial", *(f"docs/howto/{name}" for name in HOWTO))
+        pytest.param(page_name, marks=[pytest.mark.trial] * (Path(page_name).name in LONG))
+        for page_name in ("README", "docs/tutorial", *(f"docs/howto/{name}" for name in HOWTO))
     ],
 )
 def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None:
@@ -189,8 +189,8 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
 
     def run(words: Iterable[str], path: str = "") -> None:
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{path}"}
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, stderr=-1, text=True, env=environment)
-        assert done.returncode == 0, f"{page.stem}: {words}: {done.stderr[-2000:]}"
+        result = subprocess.run([sys.executable, *words], cwd=tmp_path, stderr=-1, text=True, env=environment)
+        assert result.returncode == 0, f"{page.stem}: {words}: {result.stderr[-2000:]}"
 
     exports = re.findall(r"^    synth (export out .*)", page.read_text("utf-8"), re.M)
     scripts = []
@@ -204,8 +204,8 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
     for title, text in blocks(page, "toml"):
         (tmp_path / title).write_text(text)
         run(pip.split())
-        found = f"(p,) = importlib.metadata.entry_points(group='sulcus.{page.stem}'); p.load()()"
-        run(["-c", f"import importlib.metadata; {found}"], "site")
+        load = f"(p,) = importlib.metadata.entry_points(group='sulcus.{page.stem}'); p.load()()"
+        run(["-c", f"import importlib.metadata; {load}"], "site")
 
 
 GAP = """
@@ -232,14 +232,14 @@ def test_the_commands_that_measure_the_gap_run_in_small(tmp_path: Path) -> None:
     assert [name for _, name in lines] == ["render", *2 * ["train"], *4 * ["eval"]]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     words = [sys.executable, "-c", GAP, json.dumps(commands)]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr[-2000:]
-    scores = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"model"')]
+    result = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stderr[-2000:]
+    scores = [json.loads(line) for line in result.stdout.splitlines() if line.startswith('{"model"')]
     assert [(Path(score["model"]).name, score["input"]) for score in scores] == [
         (network, tested) for network in ("ideal", "recovered") for tested in ("ideal", "recovered")
     ]
-    assert len({json.dumps([one["name"] for one in score["sequences"]]) for score in scores}) == 1
-    assert all(one["force_mae"] > 0 for score in scores for one in score["sequences"])
+    assert len({json.dumps([sequence["name"] for sequence in score["sequences"]]) for score in scores}) == 1
+    assert all(sequence["force_mae"] > 0 for score in scores for sequence in score["sequences"])
 
 
 @pytest.mark.trial
@@ -249,17 +249,17 @@ def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path: Path) -> N
     shutil.copy(ROOT / "mkdocs.yml", tmp_path)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
     environment = {**os.environ, "PYTHONPATH": "docs"}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stdout + result.stderr
     site = tmp_path / "site"
     fences = len(list(blocks(DOCS / "science.md", "math")))
     assert (site / "science.html").read_text("utf-8").count("<math") == fences
-    broken, pages = [], [page for page in site.rglob("*.html") if page.name != "404.html"]
+    faults, pages = [], [page for page in site.rglob("*.html") if page.name != "404.html"]
     for page in pages:
         for tag, link in re.findall(r"""<(\w+)\b[^>]*? (?:src|href)="([^"#]+)""", page.read_text("utf-8")):
             if re.match(r"([a-z]+:|//)", link):
-                broken += [f"{page.name} loads {link}"] * (tag != "a" and not link.startswith("data:"))
+                faults += [f"{page.name} loads {link}"] * (tag != "a" and not link.startswith("data:"))
             elif not (page.parent / unquote(link)).resolve().is_file():
-                broken.append(f"{page.relative_to(site)}: {link}")
+                faults.append(f"{page.relative_to(site)}: {link}")
     assert len(pages) > 20
-    assert not broken, "\n".join(broken)
+    assert not faults, "\n".join(faults)

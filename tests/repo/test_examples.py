@@ -25,12 +25,12 @@ pytestmark = pytest.mark.slow
 
 
 def test_reading_a_dataset(out: Path) -> None:
-    found = read_dataset.describe(Dataset(out)[0])
-    assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
-    assert found["peak_force_mn"] == pytest.approx(4.5239, abs=1e-3)
-    assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
-    assert found["largest_motion_px"] == pytest.approx(5.0368, abs=0.01)
-    assert found["median_flow_error_px"] < 0.2
+    figures = read_dataset.describe(Dataset(out)[0])
+    assert figures["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
+    assert figures["peak_force_mn"] == pytest.approx(4.5239, abs=1e-3)
+    assert figures["labelled_force_mn"] == pytest.approx(figures["peak_force_mn"], rel=0.02)
+    assert figures["largest_motion_px"] == pytest.approx(5.0368, abs=0.01)
+    assert figures["median_flow_error_px"] < 0.2
 
 
 @pytest.mark.trial
@@ -39,25 +39,25 @@ def test_a_dataset_with_custom_motion_camera_and_appearance(tmp_path: Path) -> N
     assert verify_dataset(tmp_path / "stirred").good
     sequence = Dataset(tmp_path / "stirred")[0]
     pose, tip = sequence["camera"][:], np.array(sequence.attrs["mechanics"]["instruments"][0]["tip_mm"])[:, 0]
-    swung = np.degrees(np.arccos((np.trace(pose[0, :3, :3].T @ pose[-1, :3, :3]) - 1) / 2))
-    assert 4 * 0.44 < swung < 10 * 0.44  # degrees in eleven frames of 25 a second
-    loaded = np.linalg.norm(sequence["force"][:], axis=1) > 0.1
-    across = np.linalg.norm(tip[loaded, None, :2] - tip[None, loaded, :2], axis=-1).max()
-    assert 2.0 * 0.8 < across < 4.0 * 1.1  # mm, the circle's diameter less what the tissue gives
+    swing_deg = np.degrees(np.arccos((np.trace(pose[0, :3, :3].T @ pose[-1, :3, :3]) - 1) / 2))
+    assert 4 * 0.44 < swing_deg < 10 * 0.44  # degrees in eleven frames of 25 a second
+    is_loaded = np.linalg.norm(sequence["force"][:], axis=1) > 0.1
+    diameter_mm = np.linalg.norm(tip[is_loaded, None, :2] - tip[None, is_loaded, :2], axis=-1).max()
+    assert 2.0 * 0.8 < diameter_mm < 4.0 * 1.1  # mm, the circle's diameter less what the tissue gives
 
 
 def test_rendering_a_frame() -> None:
     scene = render_frame.push()
     frame = scene.frame(scene.strongest)
-    found = render_frame.describe(scene, frame)
-    assert found["force_mn"] == pytest.approx(9.71, rel=1e-3)
-    assert found["labelled_force_mn"] == pytest.approx(found["force_mn"], rel=0.03)
-    assert found["largest_motion_mm"] == pytest.approx(1.528, rel=1e-2)
-    assert found["largest_flow_px"] == pytest.approx(7.311, rel=1e-2)
+    figures = render_frame.describe(scene, frame)
+    assert figures["force_mn"] == pytest.approx(9.71, rel=1e-3)
+    assert figures["labelled_force_mn"] == pytest.approx(figures["force_mn"], rel=0.03)
+    assert figures["largest_motion_mm"] == pytest.approx(1.528, rel=1e-2)
+    assert figures["largest_flow_px"] == pytest.approx(7.311, rel=1e-2)
     assert frame.rgb.shape == (240, 320, 3)
     assert frame.rgb[100:140, 140:180].mean() == pytest.approx(184.2, abs=3)
     half = render_frame.push(0.15)
-    assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
+    assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(figures["force_mn"] / 2, rel=1e-6)
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
 
 
@@ -77,20 +77,20 @@ def test_an_instrument_of_ones_own(tmp_path: Path) -> None:
 @pytest.mark.trial
 def test_a_block_of_liver_under_two_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["liver_block.py", str(tmp_path)])
-    made = runpy.run_path(str(ROOT / "examples" / "liver_block.py"))
-    block, lens, rest, truth = made["block"], made["camera"], made["rest"], made["renderer"].rest
+    names = runpy.run_path(str(ROOT / "examples" / "liver_block.py"))
+    block, lens, rest, truth = names["block"], names["camera"], names["rest"], names["renderer"].rest
     turn, _ = cv2.Rodrigues(lens.rotation)
 
-    def projected(points: np.ndarray) -> np.ndarray:
+    def project_points(points: np.ndarray) -> np.ndarray:
         return np.asarray(cv2.projectPoints(points, turn, lens.translation, lens.K, None)[0][:, 0])
 
-    outline = np.rint(cv2.convexHull(projected(rest).astype(np.float32))).astype(np.int32)
-    covered = cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), outline, 1) > 0
-    assert (truth.tissue & covered).sum() / (truth.tissue | covered).sum() > 0.98
-    corners = (rest + 3 * made["dent"])[block.faces[truth.face[truth.tissue]]]
-    moved = projected(np.einsum("nk,nkc->nc", truth.bary[truth.tissue], corners))
+    outline = np.rint(cv2.convexHull(project_points(rest).astype(np.float32))).astype(np.int32)
+    hull = cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), outline, 1) > 0
+    assert (truth.tissue & hull).sum() / (truth.tissue | hull).sum() > 0.98
+    corners = (rest + 3 * names["dent"])[block.faces[truth.face[truth.tissue]]]
+    moved_px = project_points(np.einsum("nk,nkc->nc", truth.bary[truth.tissue], corners))
     flow, pixels = np.load(tmp_path / "3.npy"), np.argwhere(truth.tissue)[:, ::-1]
-    np.testing.assert_allclose(flow[truth.tissue], moved - pixels, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(flow[truth.tissue], moved_px - pixels, rtol=0, atol=1e-6)
     sunk_px = 3 * np.sin(np.radians(15)) * 2200 / 291  # 3 mm along z, 9 mm above the plane at 300 mm
     assert np.linalg.norm(flow, axis=2).max() == pytest.approx(sunk_px, rel=0.03)
     assert not flow[~truth.tissue].any()
@@ -98,7 +98,7 @@ def test_a_block_of_liver_under_two_lamps(tmp_path: Path, monkeypatch: pytest.Mo
     assert np.abs(np.diff(pictures, axis=0)).max(axis=(1, 2, 3)).min() > 100, "highlights move with the dent"
     # Each lamp has a highlight on its own side, and both have two.
     sides = []
-    for lamps in (made["lamps"][:1], made["lamps"][1:], made["lamps"]):
+    for lamps in (names["lamps"][:1], names["lamps"][1:], names["lamps"]):
         shot = synth.Renderer(synth.SceneContent(block, lamps), lens).render(synth.SceneState(rest), 0)
         assert not shot.tool.any()
         sides.append([int(half.sum()) for half in np.split(shot.glare, 2, axis=1)])
@@ -125,7 +125,7 @@ def test_a_custom_flow_back_end(out: Path) -> None:
 def test_a_custom_method(out: Path, tmp_path: Path) -> None:
     from bench.recording.from_sequence import export_recording
 
-    found = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
-    assert found["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
-    assert found["spring"].scores["mae_mn"] == pytest.approx(0.644, rel=0.1)
-    assert found["stiffer"].scores["r"] == pytest.approx(found["spring"].scores["r"], abs=1e-6)
+    methods = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
+    assert methods["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
+    assert methods["spring"].scores["mae_mn"] == pytest.approx(0.644, rel=0.1)
+    assert methods["stiffer"].scores["r"] == pytest.approx(methods["spring"].scores["r"], abs=1e-6)

@@ -4,7 +4,7 @@ import ast
 from functools import cache
 from pathlib import Path
 
-from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
+from sources import PACKAGES, ROOT, imports, list_imports, module, parse, sources
 
 INSIDE = {
     "synth": "arrays errors arguments fields formats plugins system fem.law_choice job flow flow.stereo "
@@ -17,7 +17,9 @@ INSIDE = {
     "evidence": "",
     "weights": "",
 }
-ORDER = [name for top, names in INSIDE.items() for name in (top, *(f"{top}.{one}" for one in names.split()))]
+ORDER = [
+    name for top, names in INSIDE.items() for name in (top, *(f"{top}.{part}" for part in names.split()))
+]
 """Packages, and files outside of any, from the ground up: each may import from those before it."""
 
 APART = ("synth.fem", "synth.render", "synth.flow")
@@ -26,7 +28,7 @@ APART = ("synth.fem", "synth.render", "synth.flow")
 
 def package(name: str) -> str:
     """The entry of `ORDER` that a module belongs to: the longest match."""
-    return max((one for one in ORDER if name == one or name.startswith(f"{one}.")), key=len)
+    return max((entry for entry in ORDER if name == entry or name.startswith(f"{entry}.")), key=len)
 
 
 @cache
@@ -44,26 +46,31 @@ def test_imports_go_down_only() -> None:
     place = {name: k for k, name in enumerate(ORDER)}
     up = []
     for path in sources(*PACKAGES):
-        mine = package(module(path))
+        importer = package(module(path))
         for name in ours(path):
-            other = package(name)
-            if place[other] > place[mine] and not name.startswith(f"{module(path)}."):
+            imported_package = package(name)
+            if place[imported_package] > place[importer] and not name.startswith(f"{module(path)}."):
                 up.append(f"{path.relative_to(ROOT)} imports {name}")
     assert not up, "\n".join(up)
 
 
 def test_every_package_is_in_the_order() -> None:
     product = ("synth", "learn", "bench")
-    found = {module(path.parent / "__init__.py") for path in sources(*product)}
-    found |= {module(path) for name in product for path in (ROOT / name).glob("*.py")}
-    assert found <= set(ORDER), sorted(found - set(ORDER))
+    packages = {module(path.parent / "__init__.py") for path in sources(*product)}
+    packages |= {module(path) for name in product for path in (ROOT / name).glob("*.py")}
+    assert packages <= set(ORDER), sorted(packages - set(ORDER))
 
 
 def test_physics_rendering_and_flow_do_not_import_each_other() -> None:
-    for one in APART:
-        for path in sources(one.replace(".", "/")):
-            met = [name for name in ours(path) for other in APART if other != one and name.startswith(other)]
-            assert not met, f"{path} imports {met}"
+    for package_name in APART:
+        for path in sources(package_name.replace(".", "/")):
+            crossings = [
+                name
+                for name in ours(path)
+                for other in APART
+                if other != package_name and name.startswith(other)
+            ]
+            assert not crossings, f"{path} imports {crossings}"
 
 
 def test_numerics_never_see_a_job() -> None:
@@ -79,28 +86,30 @@ def test_the_product_does_not_import_evidence() -> None:
 
 def test_every_package_has_a_line_that_describes_it() -> None:
     for folder in {path.parent for path in sources(*PACKAGES)}:
-        described = ast.get_docstring(parsed(folder / "__init__.py"))
-        assert described, f"{folder} has no docstring"
-        assert "\n" not in described, f"{folder}: its docstring has more than one line"
+        docstring = ast.get_docstring(parse(folder / "__init__.py"))
+        assert docstring, f"{folder} has no docstring"
+        assert "\n" not in docstring, f"{folder}: its docstring has more than one line"
 
 
-def reached(*packages: str) -> set[str]:
+def collect_imports(*packages: str) -> set[str]:
     """Names of all modules that importing these packages' modules imports, directly or through others."""
-    loaded = {}
+    imports_of = {}
     for path in sources(*PACKAGES):
-        top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
-        loaded[module(path)] = set(imported(ast.Module(top, [])))
-    found: set[str] = set()
-    todo = [name for name in loaded if name.split(".")[0] in packages]
+        top = [node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        imports_of[module(path)] = set(list_imports(ast.Module(top, [])))
+    reached: set[str] = set()
+    todo = [name for name in imports_of if name.split(".")[0] in packages]
     while todo:
-        for name in loaded.get(todo.pop(), set()) - found:
-            found.add(name)
+        for name in imports_of.get(todo.pop(), set()) - reached:
+            reached.add(name)
             todo.append(name)
-    return found
+    return reached
 
 
 def test_learn_loads_no_renderer_through_another_module() -> None:
-    found = reached("learn")
-    assert {"torch", "synth.dataset.store", "synth.job.schema"} <= found
-    assert not [name for name in found if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
-    assert "synth.sequence.simulation" in reached("bench") | reached("synth"), "the walk finds no modules"
+    reached = collect_imports("learn")
+    assert {"torch", "synth.dataset.store", "synth.job.schema"} <= reached
+    assert not [name for name in reached if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
+    assert "synth.sequence.simulation" in collect_imports("bench") | collect_imports("synth"), (
+        "the walk finds no modules"
+    )

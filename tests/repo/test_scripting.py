@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_model import write_model
-from sources import ROOT, imported, parsed, sources
+from sources import ROOT, list_imports, parse, sources
 
 import bench
 import learn
@@ -40,9 +40,9 @@ HEAVY = {"numpy", "pydantic", "torch", "mitsuba", "drjit", "scipy", "cv2", "zarr
 )
 def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> None:
     program += "\nimport sys; print(*sorted({m.split('.')[0] for m in sys.modules}))"
-    found = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True).split()
-    assert "synth" in found
-    assert not set(found) & light
+    modules = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True).split()
+    assert "synth" in modules
+    assert not set(modules) & light
 
 
 ESTIMATE = """
@@ -70,17 +70,19 @@ app(["estimate", "press.npz", "--membrane", "stripped", "--out", "out"], standal
 def test_only_training_imports_pytorch(program: str, tmp_path: Path) -> None:
     program = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules))\n" + program
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, env=environment)
-    assert done.stdout.decode().split()[-1] == "False", done.stderr.decode()
-    assert b"Traceback" not in done.stderr
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, env=environment
+    )
+    assert result.stdout.decode().split()[-1] == "False", result.stderr.decode()
+    assert b"Traceback" not in result.stderr
 
 
 def test_pytorch_is_imported_by_training_and_conversion_alone() -> None:
     """On import: functions that use the weights themselves import it when they are called."""
     apart = ("learn/training/", "learn/network/", "learn/inference/convert.py")
     for path in sources("synth", "learn", "bench"):
-        top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
-        if "torch" in {name.split(".")[0] for name in imported(ast.Module(top, []))}:
+        top = [node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        if "torch" in {name.split(".")[0] for name in list_imports(ast.Module(top, []))}:
             assert str(path.relative_to(ROOT)).startswith(apart)
 
 
@@ -94,14 +96,14 @@ GREY = np.full((2, 40, 40, 3), 90, np.uint8)
 FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
 
 
-def predict_force(*given: Any) -> Any:
+def predict_force(*inputs: Any) -> Any:
     """By a network with one camera."""
     with tempfile.TemporaryDirectory() as folder:
-        return learn.predict_force(learn.load_model(write_model(Path(folder) / "model")), *given)
+        return learn.predict_force(learn.load_model(write_model(Path(folder) / "model")), *inputs)
 
 
 @pytest.mark.parametrize(
-    ("named", "call"),
+    ("name", "call"),
     [
         ("rate_hz", lambda: bench.Settings(rate_hz=0)),
         ("scale", lambda: check_scale(0.0)),
@@ -119,8 +121,8 @@ def predict_force(*given: Any) -> Any:
         ("rest_frame", lambda: bench.estimate(GREY, scale_mm_per_px=0.1, tissue=TISSUE, rest_frame=99)),
     ],
 )
-def test_an_invalid_argument_is_refused_by_name(named: str, call: Callable[[], object]) -> None:
-    with pytest.raises(synth.UserError, match=named):
+def test_an_invalid_argument_is_refused_by_name(name: str, call: Callable[[], object]) -> None:
+    with pytest.raises(synth.UserError, match=name):
         call()
 
 
@@ -140,14 +142,14 @@ def test_a_model_estimates_force_and_the_bench_scores_it(out: Path, tmp_path: Pa
     np.testing.assert_allclose(unknown * about[2], force, rtol=1e-4, atol=1e-4)
 
     recording = bench.export_recording(sequence, tmp_path / "recording")
-    own = {"none": lambda frame, scene, picture: bench.ForceEstimate(np.zeros(3))}
-    every = bench.Settings(rate_hz=None)
-    result = bench.score(recording, model, methods=own, settings=every, baselines=False)
+    methods = {"none": lambda frame, scene, picture: bench.ForceEstimate(np.zeros(3))}
+    settings = bench.Settings(rate_hz=None)
+    result = bench.score(recording, model, methods=methods, settings=settings, baselines=False)
     assert result.main == "D2FNet", "with baselines off, physics must not run"
     assert {"D2FNet", "none"} <= set(result.methods)
     assert result.methods["none"].scores["mae_mn"] == pytest.approx(np.abs(result.sensor_mn).mean(), rel=0.2)
     assert {path.name for path in tmp_path.iterdir()} == {"model", "recording"}, "scoring writes no files"
-    assert bench.score(recording, settings=every, baselines=False).main == "physics"
+    assert bench.score(recording, settings=settings, baselines=False).main == "physics"
 
 
 @pytest.mark.trial
@@ -163,7 +165,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         exec(compile(cell, f"cell {number}", "exec"), names)
     assert names["recovered"].trusted.all()
     assert names["off_px"] < 0.5
-    estimated, true = (np.linalg.norm(names[what], axis=1) for what in ("predicted", "applied"))
+    estimated, true = (np.linalg.norm(names[name], axis=1) for name in ("predicted", "applied"))
     assert estimated[0] == pytest.approx(0, abs=1e-6)
     assert np.corrcoef(estimated, true)[0, 1] > 0.8
 

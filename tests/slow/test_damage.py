@@ -36,24 +36,24 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
     """Damages a store; some damage changes no value, e.g. an unused bit of the compressed data."""
-    every = sorted(path for path in store.rglob("*") if path.is_file())
-    chunks = [path for path in every if "c" in path.relative_to(store).parts]
-    among = every if kind in ("bit", "emptied", "removed") else chunks
-    path = among[int(rng.integers(len(among)))]
+    files = sorted(path for path in store.rglob("*") if path.is_file())
+    chunks = [path for path in files if "c" in path.relative_to(store).parts]
+    candidates = files if kind in ("bit", "emptied", "removed") else chunks
+    path = candidates[int(rng.integers(len(candidates)))]
     data = bytearray(path.read_bytes())
-    at = int(rng.integers(len(data)))
+    offset = int(rng.integers(len(data)))
     if kind in ("bit", "bytes"):
-        for k in [at] if kind == "bit" else rng.integers(len(data), size=16):
+        for k in [offset] if kind == "bit" else rng.integers(len(data), size=16):
             data[k] ^= 1 << int(rng.integers(8))
         path.write_bytes(data)
     elif kind == "truncated":
-        path.write_bytes(data[:at])
+        path.write_bytes(data[:offset])
     elif kind == "emptied":
         path.write_bytes(b"")
     elif kind == "removed":
         path.unlink()
     elif kind == "zeroed":
-        path.write_bytes(data[:at] + bytes(len(data[at : at + 512])) + data[at + 512 :])
+        path.write_bytes(data[:offset] + bytes(len(data[offset : offset + 512])) + data[offset + 512 :])
     elif kind == "swapped":  # both files are intact, but of other frames or another field
         other = chunks[int(rng.integers(len(chunks)))]
         path.write_bytes(other.read_bytes())
@@ -65,15 +65,15 @@ def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
         value = array[place]
         array[place] = ~value if array.dtype.kind in "bu" else np.nextafter(value, np.inf, dtype=array.dtype)
     else:
-        metadata = [one for one in every if one.name == "zarr.json"]
+        metadata = [file for file in files if file.name == "zarr.json"]
         path = metadata[int(rng.integers(len(metadata)))]
         document = json.loads(path.read_text())
         leaves = [leaf for leaf in _leaves(document) if kind == "edited" or isinstance(leaf[0], dict)]
         holder, key = leaves[int(rng.integers(len(leaves)))]
         old = holder.pop(key) if kind == "key gone" else holder[key]
         if kind == "edited":
-            plain = isinstance(old, (int, float)) and not isinstance(old, bool)
-            holder[key] = old + 1 if plain else f"{old}x" if isinstance(old, str) else not old
+            is_number = isinstance(old, (int, float)) and not isinstance(old, bool)
+            holder[key] = old + 1 if is_number else f"{old}x" if isinstance(old, str) else not old
         path.write_text(json.dumps(document))
 
 
@@ -85,33 +85,33 @@ def _leaves(node: Any) -> Iterator[tuple[Any, Any]]:
             yield node, key
 
 
-def same(original: Path, copy: Path) -> bool:
+def are_equal(original: Path, copy: Path) -> bool:
     """Whether plain Zarr reads the same values, attributes and axes from both."""
     first = zarr.open_group(str(original), mode="r")
     try:
         second = zarr.open_group(str(copy), mode="r")
         return dict(first.attrs) == dict(second.attrs) and all(
-            dict(one.attrs) == dict(two.attrs)
-            and one.dtype == two.dtype
-            and one.metadata.dimension_names == two.metadata.dimension_names
-            and np.array_equal(one[...], two[...])
-            for one, two in ((first[name], second[name]) for name in first.attrs["field_hashes"])
+            dict(array.attrs) == dict(other.attrs)
+            and array.dtype == other.dtype
+            and array.metadata.dimension_names == other.metadata.dimension_names
+            and np.array_equal(array[...], other[...])
+            for array, other in ((first[name], second[name]) for name in first.attrs["field_hashes"])
         )
     except Exception:  # any error: it can't be read
         return False
 
 
 def test_damage_that_changes_a_value_is_found(root: Path, tmp_path: Path) -> None:
-    rng, changed = np.random.default_rng(0), Counter[str]()
-    identity, paths = str(Folder(root).described()["identity"]), Dataset(root).paths
+    rng, changes = np.random.default_rng(0), Counter[str]()
+    identity, paths = str(Folder(root).read_description()["identity"]), Dataset(root).paths
     for k, kind in enumerate(KINDS * EACH):
         copy = tmp_path / paths[k % 2].name
         shutil.copytree(paths[k % 2], copy)
         damage(copy, kind, rng)
-        if not same(paths[k % 2], copy):
-            changed[kind] += 1
-            found = list(verify.check_sequence(copy, identity, Stopwatch()))
-            measured = [one.good for _, one in found if isinstance(one, Measure)]
-            assert not all(measured), f"{k}: {kind}"
+        if not are_equal(paths[k % 2], copy):
+            changes[kind] += 1
+            checks = list(verify.check_sequence(copy, identity, Stopwatch()))
+            outcomes = [check.good for _, check in checks if isinstance(check, Measure)]
+            assert not all(outcomes), f"{k}: {kind}"
         shutil.rmtree(copy)
-    assert set(changed) == set(KINDS), "a kind that never changes a value"
+    assert set(changes) == set(KINDS), "a kind that never changes a value"

@@ -17,7 +17,7 @@ BRAINS = 90
 TINY = ["--preset", "tiny", "size=32", "arch.width=8", "--json"]
 
 
-def reported(*words: object) -> dict[str, Any]:
+def run_json(*words: object) -> dict[str, Any]:
     return dict(json.loads(run(app, *words).stdout.splitlines()[-1]))
 
 
@@ -33,7 +33,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trained") / "model"
-    result = reported("train", dataset, "-o", out, "--input", "recovered", "--epochs", 6, *TINY)
+    result = run_json("train", dataset, "-o", out, "--input", "recovered", "--epochs", 6, *TINY)
     assert result["intervals"] >= 9
     return out
 
@@ -43,11 +43,11 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sequences of other mechanics: the same forces move the tissue in a wider area."""
     folder, usual = tmp_path_factory.mktemp("foreign"), phantom.displacement
 
-    def dragged(x: Any, y: Any, force: Any, young: float) -> Any:
+    def widen(x: Any, y: Any, force: Any, young: float) -> Any:
         return 3 * usual(x / 8, y / 8, force, young)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(phantom, "displacement", dragged)
+        patch.setattr(phantom, "displacement", widen)
         for index in range(500, 512):
             phantom.write(folder, index, anatomy_seed=index)
     return folder
@@ -63,7 +63,7 @@ def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     others = {*card.groups["fit"], *card.groups["select"], *card.groups["test"]}
     assert not set(card.groups["intervals"]) & others
     assert card.no_intervals == ""
-    wide, _ = reported("eval", model, dataset, "--json")["coverage"]
+    wide, _ = run_json("eval", model, dataset, "--json")["coverage"]
     assert wide["level"] == 0.9
     # 27 sequences: a share of 0.9 has a standard error of 0.06 if each held or failed as a whole.
     for name in ("size", "x", "y", "z"):
@@ -71,7 +71,7 @@ def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     assert wide["out_of_distribution"] < 0.15
     # A component that one camera can't measure has an interval too.
     assert wide["width_z_mn"] > 0
-    other, _ = reported("eval", model, foreign, "--json")["coverage"]
+    other, _ = run_json("eval", model, foreign, "--json")["coverage"]
     assert other["out_of_distribution"] > 0.5
     assert other["width_mn"] > 2 * wide["width_mn"]
     assert other["size"]["mean"] > 0.8

@@ -19,9 +19,9 @@ def test_a_lost_dask_worker_changes_no_byte(tmp_path: Path) -> None:
     import psutil
     from distributed.deploy.subprocess import SubprocessCluster
 
-    root, here = tmp_path / "cluster", "127.0.0.1"
-    alone = {"n_workers": 2, "threads_per_worker": 1, "worker_class": "distributed.Worker"}
-    with SubprocessCluster(host=here, dashboard_address=f"{here}:0", **alone) as cluster:
+    root, host = tmp_path / "cluster", "127.0.0.1"
+    cluster_options = {"n_workers": 2, "threads_per_worker": 1, "worker_class": "distributed.Worker"}
+    with SubprocessCluster(host=host, dashboard_address=f"{host}:0", **cluster_options) as cluster:
         victim = psutil.Process(cluster.workers[0].process.pid)
 
         def kill_half_way() -> None:
@@ -32,10 +32,10 @@ def test_a_lost_dask_worker_changes_no_byte(tmp_path: Path) -> None:
         killer = threading.Thread(target=kill_half_way, daemon=True)
         killer.start()
         address = cluster.scheduler_address.replace("tcp", "dask")
-        made = engine.run_job(JOB, root, options("slow", workers=None, engine=address), Silent())
+        summary = engine.run_job(JOB, root, options("slow", workers=None, engine=address), Silent())
         killer.join(timeout=10)
         assert not killer.is_alive(), "none was killed"
     calm = engine.run_job(JOB, tmp_path / "local", options("sequence"), Silent())
-    assert (made.done, made.failed) == (6, {})
-    assert made.content_hash == calm.content_hash
+    assert (summary.done, summary.failed) == (6, {})
+    assert summary.content_hash == calm.content_hash
     assert not list(root.glob("*.part"))

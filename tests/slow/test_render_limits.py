@@ -16,7 +16,7 @@ from synth.sequence.rest_scene import RestScene, at_rest
 Changes = dict[str, Any]
 
 
-def lifted(scene: RestScene) -> Changes:
+def lift_surface(scene: RestScene) -> Changes:
     """Arguments of a state: the surface pulled up by a Gaussian of 2 mm under an instrument."""
     centre = np.zeros(2)
     lift = 2.0 * np.exp(-((scene.surface.vertices[:, :2] - centre) ** 2).sum(axis=1) / 18.0)
@@ -41,7 +41,7 @@ def degenerate(scene: RestScene) -> Changes:
     return {"vertices": vertices}
 
 
-def filled_view(scene: RestScene) -> Changes:
+def fill_view(scene: RestScene) -> Changes:
     """An instrument directly in front of the lens."""
     towards = scene.renderer.camera.centre / np.linalg.norm(scene.renderer.camera.centre)
     close = 240 * towards + np.array([[0.5, 0, 0], [-0.5, 0, 0]])
@@ -54,7 +54,7 @@ CASES: dict[str, tuple[Changes, Callable[[RestScene], Changes] | None]] = {
     "steep fold": ({"render": {"tilt_deg": 20.0}}, fold),
     "tilt 60 deg, aperture 30 mm": ({"render": {"tilt_deg": 60.0, "aperture_mm": 30.0}}, None),
     "tilt 85 deg": ({"render": {"tilt_deg": 85.0}}, None),
-    "tool fills the view": ({}, filled_view),
+    "tool fills the view": ({}, fill_view),
     "strong distortion": ({"render": {"distortion": (-8.0, 30.0, 0.02, -0.02, 0.0)}}, None),
     "folding distortion": ({"render": {"distortion": (-200.0, 0.0, 0.0, 0.0, 0.0)}}, None),
     LARGE: ({"render": {"size": (3840, 2160), "spp": 1}}, None),
@@ -76,7 +76,7 @@ def test_a_hard_case_gives_true_labels_or_a_clear_error(name: str) -> None:
     try:
         scene = at_rest(Job.model_validate({**sections, "seed": 11, "render": render, "fem": pull}), 0)
         scene = replace(scene, surface=replace(scene.surface, uv=scene.surface.uv.copy()))  # is changed
-        state = lifted(scene) | (change(scene) if change else {})
+        state = lift_surface(scene) | (change(scene) if change else {})
         shot = scene.renderer.render(SceneState(**state), seed=3)
     except UserError:
         return
@@ -88,6 +88,6 @@ def test_a_hard_case_gives_true_labels_or_a_clear_error(name: str) -> None:
     faces = scene.renderer.content.tissue.faces[rest.face[rest.tissue]]
     points = np.einsum("nk,nkc->nc", rest.bary[rest.tissue], state["vertices"][faces])
     turn, _ = cv2.Rodrigues(lens.rotation)
-    there, _ = cv2.projectPoints(points, turn, lens.translation, lens.K, lens.distortion)
-    expected = there[:, 0] - np.argwhere(rest.tissue)[:, ::-1]
+    image_px, _ = cv2.projectPoints(points, turn, lens.translation, lens.K, lens.distortion)
+    expected = image_px[:, 0] - np.argwhere(rest.tissue)[:, ::-1]
     assert np.abs(expected - shot.flow[rest.tissue]).max() < 1e-2

@@ -29,15 +29,15 @@ CALLS: dict[Any, tuple[Any, ...]] = {
 }
 
 
-@pytest.mark.parametrize("function", CALLS, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("function", CALLS, ids=lambda called: called.__name__)
 def test_an_odd_argument_is_named(function: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    usual, *names = CALLS[function]
+    defaults, *names = CALLS[function]
     for name in names:
         for value in ODD:
-            with pytest.raises(UserError) as refused:
-                function(**{**usual, name: value})
-            assert re.search(rf"\b{name}\b|sequence -1|no such", str(refused.value)), (name, value)
+            with pytest.raises(UserError) as error:
+                function(**{**defaults, name: value})
+            assert re.search(rf"\b{name}\b|sequence -1|no such", str(error.value)), (name, value)
     assert not any(tmp_path.iterdir())
 
 
@@ -62,6 +62,6 @@ def test_a_motion_is_at_rest_in_frame_0_and_finite() -> None:
 
 
 def test_an_error_in_a_dataset_is_the_one_that_is_raised(tmp_path: Path) -> None:
-    opened = synth.open_dataset(tmp_path / "out", "tiny")
-    with pytest.raises(PermissionError, match="mine"), opened as folder:
+    dataset = synth.open_dataset(tmp_path / "out", "tiny")
+    with pytest.raises(PermissionError, match="mine"), dataset as folder:
         raise PermissionError(13, "mine", (folder / "000000.zarr").mkdir())  # a folder that is no sequence

@@ -26,16 +26,18 @@ def draw(make: int, number: int) -> Example:
     """A press of 24 frames, whose estimate is off by as much as the posterior is wide, on average."""
     rng = np.random.default_rng([make, number])
     curve = np.sin(np.linspace(0, np.pi, 24)) ** 2 * rng.uniform(2, 40)
-    wide = np.exp(rng.uniform(np.log(0.03), np.log(0.6)))
-    size = np.abs((1 + wide * rng.normal()) * curve + 0.01 * curve.max() * rng.normal(size=24))
-    video = VideoEstimates(size, wide * curve + 0.02 * curve.max(), 0.02 * curve, 2, float(number % 2))
+    relative_error = np.exp(rng.uniform(np.log(0.03), np.log(0.6)))
+    size = np.abs((1 + relative_error * rng.normal()) * curve + 0.01 * curve.max() * rng.normal(size=24))
+    video = VideoEstimates(
+        size, relative_error * curve + 0.02 * curve.max(), 0.02 * curve, 2, float(number % 2)
+    )
     return Example(f"make {make}", str(number), video, curve)
 
 
-def held(table: IntervalTable, one: Example) -> tuple[float, float]:
-    low, high = table.bound(one.video, 0.0)
-    return float(((low <= one.true_mn) & (one.true_mn <= high)).mean()), float(
-        (high - low).mean() / one.true_mn.max()
+def measure_coverage(table: IntervalTable, example: Example) -> tuple[float, float]:
+    low, high = table.bound(example.video, 0.0)
+    return float(((low <= example.true_mn) & (example.true_mn <= high)).mean()), float(
+        (high - low).mean() / example.true_mn.max()
     )
 
 
@@ -46,9 +48,9 @@ def table() -> IntervalTable:
 
 def test_new_videos_are_held_and_widths_follow_the_posterior(table: IntervalTable) -> None:
     new = [draw(99, k) for k in range(150)]
-    shares, widths = np.array([held(table, one) for one in new]).T
+    shares, widths = np.array([measure_coverage(table, example) for example in new]).T
     assert 0.85 < shares.mean() < 0.96
-    spread = [describe(one.video)[0, list(NAMES).index("overall spread")] for one in new]
+    spread = [describe(example.video)[0, list(NAMES).index("overall spread")] for example in new]
     order = np.argsort(spread)
     assert widths[order[:30]].mean() < 0.6 * widths[order[-30:]].mean()
     assert table.reached["all"]["score over a constant width's"] < 0.8
@@ -76,19 +78,23 @@ def test_a_video_beyond_the_calibration_and_another_motion_have_none_but_a_reaso
 
 def test_estimates_get_ends_or_none() -> None:
     curve = np.sin(np.linspace(0, np.pi, 24)) ** 2
-    likely = [ForceMixture(np.ones(1), c * np.eye(3)[:1], 0.04 * c**2 * np.eye(3)[None]) for c in 5 * curve]
-    known = [ForceEstimate(force.mean, low_mn=0.0, high_mn=9.0, likely=force) for force in likely]
-    video = gather(known, 0.05 * curve, 2, 0.5)
+    mixtures = [ForceMixture(np.ones(1), c * np.eye(3)[:1], 0.04 * c**2 * np.eye(3)[None]) for c in 5 * curve]
+    finite_estimates = [
+        ForceEstimate(force.mean, low_mn=0.0, high_mn=9.0, likely=force) for force in mixtures
+    ]
+    video = gather(finite_estimates, 0.05 * curve, 2, 0.5)
     np.testing.assert_allclose(video.spread_mn, 0.2 * np.sqrt(3) * 5 * curve, atol=1e-6)
-    bounded, reason = bound(known, video, 0.0, read_table().flow)
+    intervals, reason = bound(finite_estimates, video, 0.0, read_table().flow)
     assert reason == ""
-    assert all(one.low_mn <= one.size_mn <= one.high_mn != 9.0 for one in bounded)
-    unknown = [*known[:-1], replace(known[-1], low_mn=math.nan, high_mn=math.nan)]
-    for estimates, by in ((known, "dis 1"), (unknown, read_table().flow)):
-        bounded, reason = bound(estimates, video, 0.0, by)
+    assert all(estimate.low_mn <= estimate.size_mn <= estimate.high_mn != 9.0 for estimate in intervals)
+    nan_estimates = [*finite_estimates[:-1], replace(finite_estimates[-1], low_mn=math.nan, high_mn=math.nan)]
+    for estimates, flow in ((finite_estimates, "dis 1"), (nan_estimates, read_table().flow)):
+        intervals, reason = bound(estimates, video, 0.0, flow)
         assert reason
-        assert np.isnan([one.high_mn for one in bounded]).all()
-        assert [one.size_mn for one in bounded] == [one.size_mn for one in known]
+        assert np.isnan([estimate.high_mn for estimate in intervals]).all()
+        assert [estimate.size_mn for estimate in intervals] == [
+            estimate.size_mn for estimate in finite_estimates
+        ]
 
 
 def test_the_stored_table_is_read_back(table: IntervalTable) -> None:

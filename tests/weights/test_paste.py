@@ -8,9 +8,9 @@ from weights import paste
 _TISSUE = np.full((120, 160, 3), [180, 90, 80], np.float32)
 
 
-def _rod(mirror: paste.Mirror | None) -> paste.Thing:
+def _rod(mirror: paste.Mirror | None) -> paste.Sprite:
     outline = "line", np.array([[0.1, 0.375], [2.1, 0.375]]), 0.2
-    return paste.Thing((outline,), np.full(3, 50.0), None, 0.0, 0.0, 0.0, (), mirror)
+    return paste.Sprite((outline,), np.full(3, 50.0), None, 0.0, 0.0, 0.0, (), mirror)
 
 
 def test_metal_mirrors_tissue_at_its_rim_and_dark_surroundings_at_its_middle() -> None:
@@ -37,22 +37,22 @@ def test_a_lamp_on_one_side_is_a_streak_along_that_side() -> None:
 
 def test_vessels_change_the_picture_but_are_tissue() -> None:
     layer = paste.add_vessels(paste.Layer.of(_TISSUE), np.random.default_rng(3))
-    changed = np.abs(layer.picture - _TISSUE).max(-1) > 20
-    assert 0.02 < changed.mean() < 0.7
+    is_changed = np.abs(layer.picture - _TISSUE).max(-1) > 20
+    assert 0.02 < is_changed.mean() < 0.7
     assert not layer.instrument.any()
 
 
 def test_instruments_of_every_kind_are_drawn_within_their_masks() -> None:
     rng = np.random.default_rng(5)
     for _ in range(12):
-        thing = paste.draw_instrument(rng, _TISSUE, _TISSUE)
-        layer = paste.paste(paste.Layer.of(_TISSUE), thing, np.zeros(2))
+        instrument = paste.draw_instrument(rng, _TISSUE, _TISSUE)
+        layer = paste.paste(paste.Layer.of(_TISSUE), instrument, np.zeros(2))
         assert np.isfinite(layer.picture).all()
         untouched = (layer.instrument == 0) & (layer.shadow < 1e-3)
         soft = 8  # px that defocus reaches
         padded = np.pad(layer.instrument > 0, soft)
-        near = np.zeros(untouched.shape, bool)
+        dilated = np.zeros(untouched.shape, bool)
         for y in range(0, 2 * soft + 1, 4):
             for x in range(0, 2 * soft + 1, 4):
-                near |= padded[y : y + 120, x : x + 160]
-        assert np.allclose(layer.picture[untouched & ~near], _TISSUE[0, 0], atol=1)
+                dilated |= padded[y : y + 120, x : x + 160]
+        assert np.allclose(layer.picture[untouched & ~dilated], _TISSUE[0, 0], atol=1)

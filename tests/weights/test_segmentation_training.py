@@ -12,8 +12,8 @@ def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes() 
     rng = np.random.default_rng(2)  # which mirrors
     frame, rest = rng.integers(0, 256, (2, 160, 224, 3), np.uint8)
     bright = np.float32(frame.sum(-1, keepdims=True) > 400).repeat(3, -1)
-    one = segmentation_training.packed((frame, rest, bright, 1 - bright))[None]
-    inputs, classes, weights = segmentation_training.batch(one, rng)
+    example = segmentation_training.pack((frame, rest, bright, 1 - bright))[None]
+    inputs, classes, weights = segmentation_training.batch(example, rng)
     assert np.allclose(np.sort(inputs.ravel()), np.sort(segmentation.prepare(frame, rest).ravel()), atol=1e-5)
     light = inputs[0, :3].sum(0)
     assert light[classes[0, 0] == 1].min() > light[weights[0, 0] == 1].max()

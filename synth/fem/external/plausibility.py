@@ -61,32 +61,34 @@ def find_permutations(
     count = np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     edge = np.bincount(pairs[:, 0], length, len(points)) / count
-    states, moved = list[int](), set[int]()
+    states, swapped_names = list[int](), set[int]()
     for k in range(1, len(displacement)):
         u = np.asarray(displacement[k], np.float64)
-        off = np.linalg.norm(u - (links @ u) / count[:, None], axis=1)
-        odd = np.flatnonzero(off > _OUT_OF_LINE * edge)
-        if len(odd) < 2:
+        deviation = np.linalg.norm(u - (links @ u) / count[:, None], axis=1)
+        outliers = np.flatnonzero(deviation > _OUT_OF_LINE * edge)
+        if len(outliers) < 2:
             continue
-        usual = np.ones(len(points))
-        usual[odd] = 0.0
-        known = links @ usual
-        near = (links @ (u * usual[:, None])) / np.maximum(known, 1)[:, None]
-        place = points[odd] + np.where(known[odd, None] > 0, near[odd], displacement[k - 1][odd])
-        away, other = cKDTree(place).query(points[odd] + u[odd])
-        swapped = odd[(other != np.arange(len(odd))) & (away < _NEAR * edge[odd])]
-        if len(swapped) > 1:
+        inliers = np.ones(len(points))
+        inliers[outliers] = 0.0
+        inlier_count = links @ inliers
+        neighbour_mean = (links @ (u * inliers[:, None])) / np.maximum(inlier_count, 1)[:, None]
+        expected = points[outliers] + np.where(
+            inlier_count[outliers, None] > 0, neighbour_mean[outliers], displacement[k - 1][outliers]
+        )
+        distance, nearest = cKDTree(expected).query(points[outliers] + u[outliers])
+        swapped_nodes = outliers[(nearest != np.arange(len(outliers))) & (distance < _NEAR * edge[outliers])]
+        if len(swapped_nodes) > 1:
             states.append(k)
-            moved |= set(names[swapped].tolist())
+            swapped_names |= set(names[swapped_nodes].tolist())
     if not states:
         return []
-    listed = sorted(moved)
-    which = ", ".join(map(str, listed[:_MOST_NAMED])) + (" ..." if len(listed) > _MOST_NAMED else "")
-    where = "" if len(set(files)) == 1 else f" ({files[states[0]].name})"
-    more = f" and {len(states) - 1} more states" if len(states) > 1 else ""
-    why = "their numbers have to stay the same"
+    name_list = sorted(swapped_names)
+    text = ", ".join(map(str, name_list[:_MOST_NAMED])) + (" ..." if len(name_list) > _MOST_NAMED else "")
+    source = "" if len(set(files)) == 1 else f" ({files[states[0]].name})"
+    rest = f" and {len(states) - 1} more states" if len(states) > 1 else ""
+    hint = "their numbers have to stay the same"
     return [
-        f"nodes {which} change places in state {states[0]}{where}{more}: {why}; the motion there is false"
+        f"nodes {text} change places in state {states[0]}{source}{rest}: {hint}; the motion there is false"
     ]
 
 
@@ -99,25 +101,25 @@ def find_exchanged_states(displacement: Map, time: Floats) -> list[str]:
     nodes = np.linspace(0, displacement.shape[1] - 1, min(displacement.shape[1], _PATH_NODES)).astype(int)
     path = np.asarray(displacement[:, nodes], np.float64).reshape(count, -1)
 
-    def bends(order: Ints, places: Ints) -> Floats:
-        before, here, after = (path[order[places + step]] for step in (-1, 0, 1))
-        left, right = time[places] - time[places - 1], time[places + 1] - time[places]
-        bend = (after - here) / right[:, None] - (here - before) / left[:, None]
+    def measure_bends(order: Ints, places: Ints) -> Floats:
+        previous, current, following = (path[order[places + step]] for step in (-1, 0, 1))
+        left_dt, right_dt = time[places] - time[places - 1], time[places + 1] - time[places]
+        bend = (following - current) / right_dt[:, None] - (current - previous) / left_dt[:, None]
         return np.asarray(np.linalg.norm(bend, axis=1))
 
-    plain, inner = np.arange(count), np.arange(1, count - 1)
-    rough = bends(plain, inner)
-    worst = inner[np.argsort(-rough, kind="stable")[:_WORST_STATES]]
-    chosen = np.unique(np.clip(worst[:, None] + [-1, 0, 1], 1, count - 1))
-    best, share, pair = np.inf, 1.0, (0, 0)
-    for i, j in combinations(chosen.tolist(), 2):
-        near = np.unique(np.clip([i - 1, i, i + 1, j - 1, j, j + 1], 1, count - 2))
-        order = plain.copy()
+    identity, interior = np.arange(count), np.arange(1, count - 1)
+    roughness = measure_bends(identity, interior)
+    worst = interior[np.argsort(-roughness, kind="stable")[:_WORST_STATES]]
+    candidates = np.unique(np.clip(worst[:, None] + [-1, 0, 1], 1, count - 1))
+    best_change, share, pair = np.inf, 1.0, (0, 0)
+    for i, j in combinations(candidates.tolist(), 2):
+        neighbours = np.unique(np.clip([i - 1, i, i + 1, j - 1, j, j + 1], 1, count - 2))
+        order = identity.copy()
         order[[i, j]] = j, i
-        before, after = float(rough[near - 1].sum()), float(bends(order, near).sum())
-        if after - before < best:
-            best, share, pair = after - before, after / max(before, 1e-30), (i, j)
-    if not (share < _SMOOTHER and best < -_ROUGHER * rough.sum()):
+        before, after = float(roughness[neighbours - 1].sum()), float(measure_bends(order, neighbours).sum())
+        if after - before < best_change:
+            best_change, share, pair = after - before, after / max(before, 1e-30), (i, j)
+    if not (share < _SMOOTHER and best_change < -_ROUGHER * roughness.sum()):
         return []
     first, second = pair
     return [
@@ -136,8 +138,8 @@ def find_speed_doubts(displacement: Map, time: Floats) -> list[str]:
         if speed < _SPEED_MM_S[0]
         else "are they in units longer than s, or is dt_s too small?"
     )
-    whole = f"the surface moves at {speed:.2g} mm/s at most, over {time[-1]:.4g} s"
-    return [f"times: {whole}; {_SPEED_MM_S[0]:g} to {_SPEED_MM_S[1]:g} mm/s are likely: {hint}"]
+    summary = f"the surface moves at {speed:.2g} mm/s at most, over {time[-1]:.4g} s"
+    return [f"times: {summary}; {_SPEED_MM_S[0]:g} to {_SPEED_MM_S[1]:g} mm/s are likely: {hint}"]
 
 
 def find_load_doubts(
@@ -156,40 +158,42 @@ def find_load_doubts(
     k = int(size.sum(axis=1).argmax())
     f, u = np.asarray(force[k], np.float64), np.asarray(displacement[k], np.float64)
     total_mn, radius = float(size[k].sum()), contact_radius(points, faces, f)
-    work, most = float((f * u).sum()), float((size[k] * np.linalg.norm(u, axis=1)).sum())
+    work, work_bound = float((f * u).sum()), float((size[k] * np.linalg.norm(u, axis=1)).sum())
     doubts, low, high = list[str](), *_LOADS
     if young_kpa is not None and not low <= (load := total_mn / (young_kpa * radius**2)) <= high:
-        where = f"a contact of {radius:.2g} mm radius and {young_kpa:g} kPa"
-        what = f"{total_mn:.3g} mN on {where} is P = {load:.2g}"
+        contact = f"a contact of {radius:.2g} mm radius and {young_kpa:g} kPa"
+        what = f"{total_mn:.3g} mN on {contact} is P = {load:.2g}"
         doubts.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
-    done = np.einsum("snd,snd->s", force, displacement, dtype=np.float64)
-    if done.min() < -_LEAST_WORK * np.abs(done).max():
-        state = int(done.argmin())
+    works = np.einsum("snd,snd->s", force, displacement, dtype=np.float64)
+    if works.min() < -_LEAST_WORK * np.abs(works).max():
+        state = int(works.argmin())
         doubts.append(
-            f"force: does negative work, {done[state] / 2:.2g} mN mm in state {state}: it has to be "
+            f"force: does negative work, {works[state] / 2:.2g} mN mm in state {state}: it has to be "
             "what acts on the tissue, not the reaction; is its sign right?"
         )
-    elif 0 < work < _ALONG * most:
-        angle = np.degrees(np.arccos(np.clip(work / max(most, 1e-300), -1, 1)))
+    elif 0 < work < _ALONG * work_bound:
+        angle = np.degrees(np.arccos(np.clip(work / max(work_bound, 1e-300), -1, 1)))
         doubts.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
     elif work <= 0:
         doubts.append(
             f"force: {total_mn:.3g} mN act on nodes that don't move; are nodes, faces and force in one order?"
         )
     else:
-        stiff = _HALF_SPACE * total_mn / (radius * work / total_mn)
-        least, largest = _YOUNG_KPA if young_kpa is None else (one * young_kpa for one in _STIFFNESS)
-        if not least <= stiff <= largest:
-            stated = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
-            what = f"load and motion are those of a tissue of {stiff:.2g} kPa, fem.young_kpa is {stated}"
+        e_kpa = _HALF_SPACE * total_mn / (radius * work / total_mn)
+        least, largest = _YOUNG_KPA if young_kpa is None else (limit * young_kpa for limit in _STIFFNESS)
+        if not least <= e_kpa <= largest:
+            label = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
+            what = f"load and motion are those of a tissue of {e_kpa:.2g} kPa, fem.young_kpa is {label}"
             doubts.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
-        borne = size.sum(axis=1, dtype=np.float64)
-        given = done / np.maximum(borne, 1e-30) ** 2  # compliance: mean motion along the load, per load
-        late = np.flatnonzero((borne > _LOADED * total_mn) & (given < _GIVES_LESS * given[k]))
-        if late.size:
-            state, why = int(late[0]), "have force and motion the same times?"
+        loads = size.sum(axis=1, dtype=np.float64)
+        compliance = works / np.maximum(loads, 1e-30) ** 2  # compliance: mean motion along the load, per load
+        late_states = np.flatnonzero(
+            (loads > _LOADED * total_mn) & (compliance < _GIVES_LESS * compliance[k])
+        )
+        if late_states.size:
+            state, hint = int(late_states[0]), "have force and motion the same times?"
             doubts.append(
-                f"force: {borne[state]:.3g} mN in state {state} move the tissue hardly at all; {why}"
+                f"force: {loads[state]:.3g} mN in state {state} move the tissue hardly at all; {hint}"
             )
     return doubts
 
@@ -207,21 +211,21 @@ def find_mirror_doubt(points: Floats, faces: Ints, displacement: Map, force: Map
     if not size.sum() > 0 or not np.linalg.norm(total) > _ONE_WAY * size.sum():
         return []
     centre, radius = (size[:, None] * points).sum(axis=0) / size.sum(), contact_radius(points, faces, f)
-    loaded = size > 0.1 * size.max()
-    normal = np.cross(*np.moveaxis(np.diff(points[faces], axis=1), 1, 0))[loaded[faces].any(axis=1)].sum(
+    is_loaded = size > 0.1 * size.max()
+    normal = np.cross(*np.moveaxis(np.diff(points[faces], axis=1), 1, 0))[is_loaded[faces].any(axis=1)].sum(
         axis=0
     )
-    along = total / np.linalg.norm(total)
-    if abs(along @ normal) < _NORMAL * np.linalg.norm(normal):
+    direction = total / np.linalg.norm(total)
+    if abs(direction @ normal) < _NORMAL * np.linalg.norm(normal):
         return []
-    near = np.linalg.norm(points - centre, axis=1) < _AROUND * radius
-    if near.sum() < _LEAST_NODES:
+    is_close = np.linalg.norm(points - centre, axis=1) < _AROUND * radius
+    if is_close.sum() < _LEAST_NODES:
         return []
-    level = np.linalg.svd(along[None])[2][1:]  # two axes of the surface
-    place = np.column_stack([(points[near] - centre) @ level.T, np.ones(near.sum())])
-    gradient = np.linalg.lstsq(place, u[near] @ level.T, rcond=None)[0][:2]
-    strain, deep = float(np.sqrt((gradient**2).sum() / 2)), float(np.abs(u[near] @ along).max())
-    if strain * radius < _SPREADS * deep or np.linalg.det(gradient) > -_MIRRORED * strain**2:
+    tangents = np.linalg.svd(direction[None])[2][1:]  # two axes of the surface
+    design = np.column_stack([(points[is_close] - centre) @ tangents.T, np.ones(is_close.sum())])
+    gradient = np.linalg.lstsq(design, u[is_close] @ tangents.T, rcond=None)[0][:2]
+    strain, depth = float(np.sqrt((gradient**2).sum() / 2)), float(np.abs(u[is_close] @ direction).max())
+    if strain * radius < _SPREADS * depth or np.linalg.det(gradient) > -_MIRRORED * strain**2:
         return []
     return [
         "motion: tissue moves towards the contact along one axis and away from it along the other: is an "
@@ -236,8 +240,8 @@ def find_pull_doubt(force: Map, out: Floats) -> list[str]:
     size = float(np.linalg.norm(largest))
     if size == 0 or largest @ out <= _PULLS * size * float(np.linalg.norm(out)):
         return []
-    right = "right for forceps or suction, which fem.instrument may name"
-    return [f"force: pulls the tissue outwards by {size:.3g} mN: {right}; or is the series upside down?"]
+    remark = "right for forceps or suction, which fem.instrument may name"
+    return [f"force: pulls the tissue outwards by {size:.3g} mN: {remark}; or is the series upside down?"]
 
 
 def contact_radius(points: Floats, faces: Ints, force: Floats) -> float:
@@ -252,12 +256,12 @@ def contact_radius(points: Floats, faces: Ints, force: Floats) -> float:
 
 def is_rigid(points: Floats, displacement: Map) -> bool:
     """Whether displacement (N, 3) of points (N, 3) is a rigid body's, to a thousandth of its largest."""
-    chosen = np.linspace(0, len(points) - 1, min(len(points), 5000)).astype(int)
-    rest, now = points[chosen], points[chosen] + displacement[chosen]
-    a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
+    sample = np.linspace(0, len(points) - 1, min(len(points), 5000)).astype(int)
+    rest, deformed = points[sample], points[sample] + displacement[sample]
+    a, b = rest - rest.mean(axis=0), deformed - deformed.mean(axis=0)
     left, _, right = np.linalg.svd(b.T @ a)
-    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    off = np.linalg.norm(b - a @ turn.T, axis=1).max()
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    gap = np.linalg.norm(b - a @ rotation.T, axis=1).max()
     return bool(
-        off < max(1e-3 * np.linalg.norm(displacement, axis=1).max(), 1e-5 * np.ptp(points, axis=0).max())
+        gap < max(1e-3 * np.linalg.norm(displacement, axis=1).max(), 1e-5 * np.ptp(points, axis=0).max())
     )

@@ -14,7 +14,7 @@ from synth.fem.external.recorded import find_run, read_arrays
 from synth.fem.external.series import MeshSeries, Units
 from synth.fem.external.vtk_series import read_files
 from synth.system import series_files
-from synth.system.series_files import inside, table_of
+from synth.system.series_files import resolve_inside, table_of
 
 
 def read_checked_series(
@@ -31,8 +31,8 @@ def read_checked_series(
     `young_kpa`: of its tissue, None: not known; `outward`: direction out of the tissue, if no instrument may
     pull. The last two series are kept. UserError: also for files that are replaced while they are read.
     """
-    written = _find_state(source, force, instruments)
-    return _read(source, units, force, instruments, patch_mm, young_kpa, outward, written)
+    stamp = _stamp_files(source, force, instruments)
+    return _read(source, units, force, instruments, patch_mm, young_kpa, outward, stamp)
 
 
 def forget() -> None:
@@ -40,10 +40,10 @@ def forget() -> None:
     _read.cache_clear()
 
 
-def _find_state(source: Path, force: str | None, instruments: str | None) -> tuple[tuple[int, ...], ...]:
+def _stamp_files(source: Path, force: str | None, instruments: str | None) -> tuple[tuple[int, ...], ...]:
     """What distinguishes the files of a series from others that replaced them."""
-    states = (file.stat() for file in series_files.list_files(source, force, instruments))
-    return tuple((state.st_ino, state.st_mtime_ns, state.st_ctime_ns, state.st_size) for state in states)
+    stats = (file.stat() for file in series_files.list_files(source, force, instruments))
+    return tuple((stat.st_ino, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) for stat in stats)
 
 
 @lru_cache(maxsize=2)
@@ -55,14 +55,14 @@ def _read(
     patch_mm: float,
     young_kpa: float | None,
     outward: tuple[float, float, float] | None,
-    written: tuple[tuple[int, ...], ...],
+    stamp: tuple[tuple[int, ...], ...],
 ) -> MeshSeries:
-    """`written`: as of `_find_state`, before the files are read."""
+    """`stamp`: as of `_stamp_files`, before the files are read."""
     series = read_series(source, units, force, instruments, patch_mm)
     doubts = doubt_load(series, young_kpa)
     if series.force is not None and outward is not None:
         doubts += plausibility.find_pull_doubt(series.force, np.array(outward))
-    if _find_state(source, force, instruments) != written:
+    if _stamp_files(source, force, instruments) != stamp:
         raise UserError(f"{source}: was replaced while it was read")
     return replace(series, cautions=(*series.cautions, *doubts))
 
@@ -90,12 +90,12 @@ def read_series(
     folder = source if source.is_dir() else source.parent
     run, table = find_run(source) if source.is_dir() else None, table_of(force)
     field = force if table is None else None
-    if source.is_dir() and len(alone := list(source.glob("*.npz"))) == 1:
-        source = alone[0]
+    if source.is_dir() and len(archives := list(source.glob("*.npz"))) == 1:
+        source = archives[0]
     if run is not None or source.suffix == ".npz":
         motion = read_arrays(run or source, units, field, recorded=run is not None)
     else:
         motion = read_files(source, units, field)
     if table is not None:
-        motion = series.press(motion, inside(folder, table), units, patch_mm)
-    return motion if instruments is None else series.equip(motion, inside(folder, instruments))
+        motion = series.press(motion, resolve_inside(folder, table), units, patch_mm)
+    return motion if instruments is None else series.equip(motion, resolve_inside(folder, instruments))

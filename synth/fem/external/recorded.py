@@ -21,7 +21,7 @@ from synth.arrays import Floats, Ints
 from synth.errors import UserError, as_user_error
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.fem.external.vtk_series import force_field
-from synth.geometry.mesh_file import Numbers, read_surface, whole
+from synth.geometry.mesh_file import Numbers, as_integers, read_surface
 from synth.geometry.skin import TRIANGLE
 from synth.system import checked_file
 
@@ -43,26 +43,26 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     `recorded`: a run of the published recorder. Its forces are an "intensity", scaled so that their peak is
     the total force; they are scaled back.
     """
-    held = checked_file.ArrayFile(file)
-    shapes = held.shapes
+    arrays = checked_file.ArrayFile(file)
+    shapes = arrays.shapes
     if len(shapes.get("points", ())) == 3 and shapes["points"][0]:
-        moved = held["points"]
-        rest = moved[0].astype(np.float64)
+        displacement = arrays["points"]
+        rest = displacement[0].astype(np.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # refused later
-            moved = moved - moved[0]
-    elif "rest" in held and (name := next((one for one in _MOTION if one in held), None)):
-        rest, moved = held["rest"].astype(np.float64), held[name]
+            displacement = displacement - displacement[0]
+    elif "rest" in arrays and (name := next((key for key in _MOTION if key in arrays), None)):
+        rest, displacement = arrays["rest"].astype(np.float64), arrays[name]
     else:
         what = "needs points (S, N, 3), or rest and displacement"
-        raise UserError(f"{file}: {what}; it has {', '.join(sorted(held))}")
-    fields = [name for name, shape in shapes.items() if shape == moved.shape]
+        raise UserError(f"{file}: {what}; it has {', '.join(sorted(arrays))}")
+    fields = [name for name, shape in shapes.items() if shape == displacement.shape]
     name, per_area = force_field(force, fields, file)
-    time = held["times"] if "times" in held else np.full(moved.shape[:1], np.nan)
-    same = time.ndim == 1 and moved.shape == (*time.shape, *rest.shape)
-    if not same or rest.shape[1:] != (3,) or len(time) < 2:
-        given = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
-        raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {given}")
-    load = None if name is None else held[name]
+    time = arrays["times"] if "times" in arrays else np.full(displacement.shape[:1], np.nan)
+    is_consistent = time.ndim == 1 and displacement.shape == (*time.shape, *rest.shape)
+    if not is_consistent or rest.shape[1:] != (3,) or len(time) < 2:
+        shape_text = f"points {rest.shape}, displacement {displacement.shape}, times {time.shape}"
+        raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {shape_text}")
+    load = None if name is None else arrays[name]
     if recorded:
         units = Units(mm=units.mm or 1.0, mn=units.mn or 1000.0, dt_s=units.dt_s)
         if load is not None and name == _RECORDED:
@@ -70,23 +70,25 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
             share = np.divide(peak, total, out=np.zeros_like(peak), where=total > 0)
             load = load * share[:, None, None]
     with as_user_error(f"{file}: its cells"):
-        named = {TRIANGLE: _faces_of(file, rest)} if recorded else {}
-        cells = named or {kind: whole(held[one]) for one, kind in _CELLS.items() if one in held}
+        surface_cells = {TRIANGLE: _read_faces(file, rest)} if recorded else {}
+        cells = surface_cells or {
+            kind: as_integers(arrays[key]) for key, kind in _CELLS.items() if key in arrays
+        }
     surface = find_surface(rest, cells, file)
     states = (
-        State(file, at, _double(moved[k]), None if load is None else _double(load[k]))
-        for k, at in enumerate(time.tolist())
+        State(file, time_s, _to_double(displacement[k]), None if load is None else _to_double(load[k]))
+        for k, time_s in enumerate(time.tolist())
     )
     return assemble(file, surface, units, len(time), states, fields, per_area)
 
 
-def _double(values: Numbers) -> Floats:
+def _to_double(values: Numbers) -> Floats:
     """Values (N, 3) in double precision; what is too large for it is infinite, which is refused later."""
     with np.errstate(over="ignore"):
         return values.astype(np.float64)
 
 
-def _faces_of(arrays: Path, rest: Floats) -> Ints:
+def _read_faces(arrays: Path, rest: Floats) -> Ints:
     """Faces (F, 3) of the surface next to the arrays, by the numbers of their points."""
     files = sorted(arrays.parent.glob("*.obj"))
     if len(files) != 1:
@@ -94,7 +96,7 @@ def _faces_of(arrays: Path, rest: Floats) -> Ints:
     data = checked_file.read_bytes(files[0], checked_file.LARGEST_MESH)
     with as_user_error(f"{files[0]}: is not a readable surface"):
         vertices, faces = read_surface(data, "obj")
-    away, nearest = cKDTree(rest).query(vertices)
-    if len(away) == 0 or away.max() > _NEAR * np.ptp(rest, axis=0).max():
+    distance, nearest = cKDTree(rest).query(vertices)
+    if len(distance) == 0 or distance.max() > _NEAR * np.ptp(rest, axis=0).max():
         raise UserError(f"{files[0]}: its vertices are not those of {arrays.name} at rest")
     return np.asarray(nearest[faces], np.int64)

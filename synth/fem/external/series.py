@@ -58,13 +58,13 @@ class MeshSeries:
     @property
     def summary(self) -> str:
         """What it is, in one line."""
-        size = " x ".join(f"{one:.3g}" for one in np.ptp(self.points, axis=0))
-        most = float(np.sqrt(np.einsum("snd,snd->sn", self.displacement, self.displacement).max()))
+        size = " x ".join(f"{extent:.3g}" for extent in np.ptp(self.points, axis=0))
+        max_mm = float(np.sqrt(np.einsum("snd,snd->sn", self.displacement, self.displacement).max()))
         load = "no force"
         if self.force is not None:
             load = f"force up to {np.linalg.norm(self.force.sum(axis=1), axis=1).max():.4g} mN"
         count = f"{len(self.time)} states over {self.time[-1]:.4g} s, {len(self.points)} nodes on the surface"
-        return f"{count}, {size} mm, displacement up to {most:.3g} mm, {load}"
+        return f"{count}, {size} mm, displacement up to {max_mm:.3g} mm, {load}"
 
     def at(self, time_s: float, name: str) -> Floats:
         """An array at a time, linear between states: float64 of the shape of one state."""
@@ -78,7 +78,7 @@ class MeshSeries:
 class State(NamedTuple):
     """One state of all M points of a mesh, in the units of its file."""
 
-    where: Path  # named in messages
+    file: Path  # named in messages
     time: float  # s; NaN: not stated
     displacement: Floats  # (M, 3)
     force: Floats | None  # (M, 3) on the nodes, or per area at rest; None: not known
@@ -93,31 +93,31 @@ class OuterSurface(NamedTuple):
     place: Ints  # (M,) for each point the first one at the same place
 
 
-def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> OuterSurface:
+def find_surface(points: Floats, cells: Mapping[int, Ints], file: Path) -> OuterSurface:
     """The outer surface of cells (see `skin`) of points (M, 3) at rest. UserError: there is none, or points
     are not finite or belong to several bodies."""
     if not len(points):
-        raise UserError(f"{where}: has no points")
+        raise UserError(f"{file}: has no points")
     if not np.abs(points).max() < _LARGEST:
-        raise UserError(f"{where}: has coordinates that are not finite, or above {_LARGEST:g}")
+        raise UserError(f"{file}: has coordinates that are not finite, or above {_LARGEST:g}")
     step = _ROUNDING * max(float(np.ptp(points, axis=0).max(initial=0)), 1e-12)
     _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     place = first[place.ravel()]
-    with as_user_error(str(where)):
+    with as_user_error(str(file)):
         if any(cell.min(initial=0) < 0 for cell in cells.values()):
             raise ValueError("a cell refers to a missing point")
-        cells = {kind: place[one] for kind, one in cells.items()}
-        outer = skin(points, cells)
-        sides = np.cross(points[outer[:, 1]] - points[outer[:, 0]], points[outer[:, 2]] - points[outer[:, 0]])
+        cells = {kind: place[cell] for kind, cell in cells.items()}
+        shell = skin(points, cells)
+        sides = np.cross(points[shell[:, 1]] - points[shell[:, 0]], points[shell[:, 2]] - points[shell[:, 0]])
         area = np.linalg.norm(sides, axis=1)  # cells may be collapsed
         if not area.max(initial=0) > 0:
             raise ValueError("its surface has no area")
-        nodes, faces = np.unique(outer[area > _ROUNDING**2 * area.max()], return_inverse=True)
+        nodes, faces = np.unique(shell[area > _ROUNDING**2 * area.max()], return_inverse=True)
     links = [np.stack([cell[:, :-1], cell[:, 1:]]).reshape(2, -1) for cell in cells.values()]
     graph = sp.coo_array((np.ones(sum(link.shape[1] for link in links)), np.hstack(links)), [len(points)] * 2)
     bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
     if len(bodies) > 1:
-        raise UserError(f"{where}: has {len(bodies)} separate bodies; write the tissue alone")
+        raise UserError(f"{file}: has {len(bodies)} separate bodies; write the tissue alone")
     return OuterSurface(points[nodes], nodes, faces.reshape(-1, 3), place)
 
 
@@ -141,107 +141,109 @@ def assemble(
     with as_user_error(f"{source}: {count} states"):
         refuse_excess(12 * count * len(nodes))
     displacement, force = np.empty((count, len(nodes), 3), np.float32), None
-    for k, (where, time_s, moved, load) in enumerate(states):
-        _refuse_wild(surface.points, moved[nodes], where)
-        if np.abs(moved - moved[place]).max(initial=0) > _ROUNDING * max(float(np.abs(moved).max()), 1e-9):
-            raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
-        files.append(where)
+    for k, (file, time_s, u, load) in enumerate(states):
+        _refuse_wild(surface.points, u[nodes], file)
+        if np.abs(u - u[place]).max(initial=0) > _ROUNDING * max(float(np.abs(u).max()), 1e-9):
+            raise UserError(f"{file}: points at one place move apart; write one body, with its nodes once")
+        files.append(file)
         times.append(time_s)
-        displacement[k] = moved[nodes]
+        displacement[k] = u[nodes]
         if load is not None:
-            force, whole = np.empty_like(displacement) if force is None else force, np.zeros_like(moved)
-            np.add.at(whole, place, load)
-            force[k] = _single(whole[nodes] / (np.bincount(place)[nodes][:, None] if per_area else 1), where)
+            force, nodal_force = np.zeros_like(displacement) if force is None else force, np.zeros_like(u)
+            np.add.at(nodal_force, place, load)
+            force[k] = _to_single(
+                nodal_force[nodes] / (np.bincount(place)[nodes][:, None] if per_area else 1), file
+            )
     _refuse_blank(displacement, files)
-    timed, time = not np.isnan(times).all(), _rising(times, files, units)
-    scale = _length(surface.points, units, source)
+    timed, time = not np.isnan(times).all(), _check_times(times, files, units)
+    scale = _find_unit_mm(surface.points, units, source)
     points = scale * surface.points
     displacement *= np.float32(scale)  # in place: series may be large
     extent, largest = float(np.ptp(points, axis=0).max()), float(max(displacement.max(), -displacement.min()))
     if not np.isfinite(extent + largest + (0.0 if force is None else float(force.sum()))):
         raise UserError(f"{source}: has values that are not finite")
-    if (start := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
-        raise UserError(f"{source}: the first state is displaced by {start:.3g} mm; it has to be at rest")
+    if (offset_mm := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
+        raise UserError(f"{source}: the first state is displaced by {offset_mm:.3g} mm; it has to be at rest")
     displacement -= displacement[0].copy()
     if largest < 1e-4 * extent:
-        has = ", ".join(fields) or "none"
-        hint = f"is unit_mm right, and which of its vectors ({has}) displacement?"
+        names = ", ".join(fields) or "none"
+        hint = f"is unit_mm right, and which of its vectors ({names}) displacement?"
         raise UserError(f"{source}: its surface of {extent:.3g} mm moves by {largest:.2g} mm only; {hint}")
-    none = np.zeros((len(time), 0, 3))  # instruments
+    no_instruments = np.zeros((len(time), 0, 3))  # instruments
     cautions = plausibility.find_permutations(points, surface.faces, displacement, nodes, files)
     cautions += plausibility.find_speed_doubts(displacement, time)
     cautions += plausibility.find_exchanged_states(displacement, time)
-    about = scale, tuple(fields), timed, None, tuple(cautions)
-    series = MeshSeries(points, surface.faces, time, displacement, none, none, *about)
+    metadata = scale, tuple(fields), timed, None, tuple(cautions)
+    series = MeshSeries(points, surface.faces, time, displacement, no_instruments, no_instruments, *metadata)
     if force is None:
         return series
-    each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
-    with np.errstate(over="ignore", invalid="ignore"):  # `bear` refuses what is infinite
-        force *= np.asarray(_force_mn(units, source) * each, np.float32)
-    return bear(series, force, source)
+    area = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):  # `add_force` refuses what is infinite
+        force *= np.asarray(_require_unit_mn(units, source) * area, np.float32)
+    return add_force(series, force, source)
 
 
-def _single(values: Floats, where: Path) -> Map:
+def _to_single(values: Floats, file: Path) -> Map:
     """Values (N, 3) in single precision. UserError: they are too large for it, or not finite."""
     if not np.abs(values).max(initial=0) < _LARGEST:
-        raise UserError(f"{where}: has values that are not finite, or above {_LARGEST:g}")
+        raise UserError(f"{file}: has values that are not finite, or above {_LARGEST:g}")
     return values.astype(np.float32)
 
 
-def _refuse_wild(points: Floats, moved: Floats, where: Path) -> None:
+def _refuse_wild(points: Floats, displacement: Floats, file: Path) -> None:
     """Raises UserError for displacement (N, 3) of points (N, 3) that isn't finite, or no motion of tissue."""
-    _single(moved, where)
-    extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(moved).max(initial=0))
+    _to_single(displacement, file)
+    extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(displacement).max(initial=0))
     if largest > extent:
-        times = f"{largest / max(extent, 1e-300):.3g} times the width of its surface"
-        what = f"is displaced by {largest:.3g}, {times}"
-        raise UserError(f"{where}: {what}; are they in one unit, and do nodes keep their numbers?")
-    wide = float(np.ptp(points + moved, axis=0).max())
-    if not extent / _MOST_STRETCH <= wide <= _MOST_STRETCH * extent:
-        raise UserError(f"{where}: its surface is {wide:.3g} wide, at rest {extent:.3g}; are values missing?")
+        ratio = f"{largest / max(extent, 1e-300):.3g} times the width of its surface"
+        what = f"is displaced by {largest:.3g}, {ratio}"
+        raise UserError(f"{file}: {what}; are they in one unit, and do nodes keep their numbers?")
+    width = float(np.ptp(points + displacement, axis=0).max())
+    if not extent / _MOST_STRETCH <= width <= _MOST_STRETCH * extent:
+        raise UserError(f"{file}: its surface is {width:.3g} wide, at rest {extent:.3g}; are values missing?")
 
 
 def _refuse_blank(displacement: Map, files: list[Path]) -> None:
     """Raises UserError for a state at rest between two that are displaced: one that wasn't written."""
     size = np.abs(displacement).max(axis=(1, 2), initial=0)
-    high = size > _DISPLACED * size.max()
-    for k in np.flatnonzero((size[1:-1] == 0) & high[:-2] & high[2:]) + 1:
-        why = "is one missing? Leave it out, or store states next to it"
-        raise UserError(f"{files[k]}: state {k} is at rest, those before and after it are displaced; {why}")
+    is_displaced = size > _DISPLACED * size.max()
+    for k in np.flatnonzero((size[1:-1] == 0) & is_displaced[:-2] & is_displaced[2:]) + 1:
+        hint = "is one missing? Leave it out, or store states next to it"
+        raise UserError(f"{files[k]}: state {k} is at rest, those before and after it are displaced; {hint}")
 
 
-def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
+def _check_times(times: list[float], files: list[Path], units: Units) -> Floats:
     """Times (S,) s from 0, as stated by the files or `dt_s`. UserError: none, or they don't rise."""
-    if (wild := np.abs(times) > _LATEST_S).any():
-        raise UserError(f"{files[state := int(wild.argmax())]}: its time is {times[state]:g} s")
+    if (is_late := np.abs(times) > _LATEST_S).any():
+        raise UserError(f"{files[state := int(is_late.argmax())]}: its time is {times[state]:g} s")
     if np.isnan(times).all():
         if units.dt_s is None:
             raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
         return np.arange(len(times), dtype=np.float64) * units.dt_s
-    if not (rises := np.diff(times) > 0).all():
-        state = int(np.argmin(rises)) + 1
+    if not (is_rising := np.diff(times) > 0).all():
+        state = int(np.argmin(is_rising)) + 1
         raise UserError(f"{files[state]}: its time {times[state]:g} s does not follow {times[state - 1]:g} s")
     return np.asarray(times, np.float64) - times[0]
 
 
-def _force_mn(units: Units, where: Path) -> float:
+def _require_unit_mn(units: Units, source: Path) -> float:
     """Millinewtons in the unit of force. UserError if it is not stated."""
     if units.mn is None:
-        raise UserError(f"{where}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
+        raise UserError(f"{source}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
     return units.mn
 
 
-def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
+def add_force(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
     """The series with forces (S, N, 3) mN on its nodes. UserError: they can't be those of a contact."""
     size, motion = np.sqrt(np.einsum("snd,snd->sn", force, force)).sum(axis=1), series.displacement
-    moved = int(np.maximum(motion.max(axis=(1, 2)), -motion.min(axis=(1, 2))).argmax())
+    peak = int(np.maximum(motion.max(axis=(1, 2)), -motion.min(axis=(1, 2))).argmax())
     if not size.max() < _LARGEST:
         raise UserError(f"{source}: has forces that are not finite, or above {_LARGEST:g} mN")
     if size[0] > 1e-3 * size.max():
         raise UserError(f"{source}: the first state bears {size[0]:.3g} mN; it has to be at rest")
-    if size[moved] <= _LEAST_LOAD * size.max():
+    if size[peak] <= _LEAST_LOAD * size.max():
         raise UserError(
-            f"{source}: where the surface is displaced most the force is {size[moved]:.2g} mN; a net force "
+            f"{source}: where the surface is displaced most the force is {size[peak]:.2g} mN; a net force "
             "is 0 wherever the tissue is held (as that of SOFA's Monitor): give the force of the contact"
         )
     if plausibility.is_rigid(series.points, motion[k := int(size.argmax())]):
@@ -259,18 +261,18 @@ def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> Mes
     `table`: .csv with columns time [s, that of the first state first], fx, fy, fz, and x, y, z of the
     contact's centre at rest, in the files' units and axes. UserError: no such table, or no node near a point.
     """
-    unit_mn = _force_mn(units, table)
-    rows = _at_states(series, table, ("fx", "fy", "fz", "x", "y", "z"))
+    unit_mn = _require_unit_mn(units, table)
+    rows = _interpolate_table(series, table, ("fx", "fy", "fz", "x", "y", "z"))
     area, force = vertex_area(series.points, series.faces), np.zeros_like(series.displacement)
     for k, row in enumerate(rows):
-        away = np.linalg.norm(series.points - series.unit_mm * row[3:], axis=1)
-        share = area * np.maximum(1 - np.square(away / patch_mm), 0)
+        distance = np.linalg.norm(series.points - series.unit_mm * row[3:], axis=1)
+        share = area * np.maximum(1 - np.square(distance / patch_mm), 0)
         if not share.any() and row[:3].any():
-            at = f"no node within {patch_mm:g} mm of the contact at {series.time[k]:g} s"
-            raise UserError(f"{table}: {at}; is its unit that of the files?")
+            fault = f"no node within {patch_mm:g} mm of the contact at {series.time[k]:g} s"
+            raise UserError(f"{table}: {fault}; is its unit that of the files?")
         with np.errstate(over="ignore", invalid="ignore"):
             force[k] = unit_mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
-    return bear(series, force, table)
+    return add_force(series, force, table)
 
 
 def equip(series: MeshSeries, table: Path) -> MeshSeries:
@@ -281,14 +283,14 @@ def equip(series: MeshSeries, table: Path) -> MeshSeries:
             f"{table}: has the tips x0, x1, ... of {count} instruments, one to three are possible"
         )
     names = [f"{axis}{k}" for k in range(count) for axis in "xyzuvw"]
-    rows = _at_states(series, table, names).reshape(len(series.time), count, 6)
+    rows = _interpolate_table(series, table, names).reshape(len(series.time), count, 6)
     size = np.linalg.norm(rows[..., 3:], axis=2, keepdims=True)
     if not size.all():
         raise UserError(f"{table}: a direction to the hand, u v w, is 0")
     return replace(series, tip=series.unit_mm * rows[..., :3], shaft=rows[..., 3:] / size)
 
 
-def _at_states(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
+def _interpolate_table(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
     """Columns (S, len(names)) of a table, linear between rows. UserError: it does not cover the states."""
     columns = read_csv(table, ("time", *names))
     time = columns["time"] - columns["time"][0]
@@ -300,18 +302,18 @@ def _at_states(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
     return np.stack([np.interp(series.time, time, column) for column in rows.T], axis=1)
 
 
-def _length(points: Floats, units: Units, source: Path) -> float:
+def _find_unit_mm(points: Floats, units: Units, source: Path) -> float:
     """Millimetres in the unit of length. UserError if it is not stated, or can't be that of a specimen."""
     extent = float(np.ptp(points, axis=0).max())
     (low, high), (least, most) = _LIKELY_MM, _POSSIBLE_MM
-    likely = {mm: name for mm, name in _LENGTHS.items() if low <= mm * extent <= high}
-    hint = " or ".join(f"{mm:g} for {name}" for mm, name in likely.items()) or "1 for mm, 1000 for m"
+    candidates = {mm: name for mm, name in _LENGTHS.items() if low <= mm * extent <= high}
+    hint = " or ".join(f"{mm:g} for {name}" for mm, name in candidates.items()) or "1 for mm, 1000 for m"
     if units.mm is None:
-        if units.guess and likely:
-            return next(iter(likely))
-        wide = f"its surface is {extent:.3g} units wide"
-        raise UserError(f"{source}: mechanics.unit_mm is needed; {wide}: {hint}?")
+        if units.guess and candidates:
+            return next(iter(candidates))
+        text = f"its surface is {extent:.3g} units wide"
+        raise UserError(f"{source}: mechanics.unit_mm is needed; {text}: {hint}?")
     if not least <= units.mm * extent <= most:
-        wide = f"its surface is {units.mm * extent:.3g} mm wide"
-        raise UserError(f"{source}: with mechanics.unit_mm {units.mm:g} {wide}; {hint}?")
+        text = f"its surface is {units.mm * extent:.3g} mm wide"
+        raise UserError(f"{source}: with mechanics.unit_mm {units.mm:g} {text}; {hint}?")
     return units.mm

@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Ints
-from synth.fem.surface_embedding import nearest, sparse_rows, vertex_area
+from synth.fem.surface_embedding import find_nearest, sparse_rows, vertex_area
 from synth.geometry.triangles import Shape
 
 _TILES = 12  # along the longer side of a scene, in which nearest triangles are searched separately
@@ -41,9 +41,9 @@ class Transfer:
 
     def move(self, u: Floats) -> Floats:
         """Displacement (V, 3) mm of the vertices, from the nodes' (N, 3) mm."""
-        turn = _rotations(self.points, self.points + u, self.faces).reshape(len(u), 9)
-        turned = (self.corner @ turn).reshape(-1, 3, 3)
-        return np.asarray(self.motion @ u + np.einsum("vij,vj->vi", turned, self.arm) - self.arm)
+        rotations = _find_rotations(self.points, self.points + u, self.faces).reshape(len(u), 9)
+        vertex_rotations = (self.corner @ rotations).reshape(-1, 3, 3)
+        return np.asarray(self.motion @ u + np.einsum("vij,vj->vi", vertex_rotations, self.arm) - self.arm)
 
     def bear(self, force: Floats) -> Floats:
         """Forces (V, 3) on the vertices, from nodal forces (N, 3); those of nodes elsewhere are left out."""
@@ -53,52 +53,54 @@ class Transfer:
 def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
     """Attaches the vertices of a scene to the nearest triangles (F, 3) of points (N, 3) mm."""
     vertices = np.ascontiguousarray(scene.vertices)
-    face, bary = _nearest(points, faces, vertices)
+    face, bary = _find_nearest(points, faces, vertices)
     nodes = faces[face]
     corner = sparse_rows(bary, nodes, len(points))
-    close = faces[np.isin(faces, nodes).any(axis=1)]
-    motion = sp.csr_array(corner + _bend(points, close, nodes, bary))
+    close_faces = faces[np.isin(faces, nodes).any(axis=1)]
+    motion = sp.csr_array(corner + _bend(points, close_faces, nodes, bary))
     arm = vertices - motion @ points  # from the curved triangles, so that rigid motion stays exact
     area = vertex_area(*scene)
     share = sp.csr_array(corner.multiply(area[:, None]))
-    whole = np.asarray(share.sum(axis=0)).ravel()
+    node_area = np.asarray(share.sum(axis=0)).ravel()
     # Nodes between the vertices, on triangles without any, are borne by the nearest vertex.
-    between = np.flatnonzero(whole == 0)
-    away, at = cKDTree(vertices).query(points[between], distance_upper_bound=2 * float(np.sqrt(area.max())))
-    near_enough = np.isfinite(away)
-    rest = sp.csr_array(
-        (np.ones(near_enough.sum()), (at[near_enough], between[near_enough])), shape=share.shape
+    empty_nodes = np.flatnonzero(node_area == 0)
+    distance, indices = cKDTree(vertices).query(
+        points[empty_nodes], distance_upper_bound=2 * float(np.sqrt(area.max()))
     )
-    scale = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
-    load = sp.csr_array(share.multiply(scale[None, :]) + rest)
-    return Transfer(motion, corner, load, points, close, arm)
+    is_close = np.isfinite(distance)
+    remainder = sp.csr_array(
+        (np.ones(is_close.sum()), (indices[is_close], empty_nodes[is_close])), shape=share.shape
+    )
+    scale = np.divide(1.0, node_area, out=np.zeros_like(node_area), where=node_area > 0)
+    load = sp.csr_array(share.multiply(scale[None, :]) + remainder)
+    return Transfer(motion, corner, load, points, close_faces, arm)
 
 
-def _nearest(points: Floats, faces: Ints, vertices: Floats) -> tuple[Ints, Floats]:
+def _find_nearest(points: Floats, faces: Ints, vertices: Floats) -> tuple[Ints, Floats]:
     """Nearest face (V,) of each vertex and the barycentrics (V, 3) there; tile by tile, among near ones."""
-    away = cKDTree(points[np.unique(faces)]).query(vertices)[0]
+    distance = cKDTree(points[np.unique(faces)]).query(vertices)[0]
     corner = np.ascontiguousarray(points[faces])
     low, high = corner.min(axis=1), corner.max(axis=1)
     index = np.floor((vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0).max() * _TILES)
     tile = np.unique(index, axis=0, return_inverse=True)[1].ravel()
     owner, bary = np.zeros(len(vertices), np.int64), np.zeros((len(vertices), 3))
-    for mine in np.split(np.argsort(tile, kind="stable"), np.cumsum(np.bincount(tile))[:-1]):
-        here, reach = vertices[mine], away[mine].max()
-        inside = (high >= here.min(axis=0) - reach) & (low <= here.max(axis=0) + reach)
-        near = np.flatnonzero(inside.all(axis=1))
-        found, bary[mine] = nearest(corner[near], here)
-        owner[mine] = near[found]
+    for members in np.split(np.argsort(tile, kind="stable"), np.cumsum(np.bincount(tile))[:-1]):
+        tile_vertices, reach = vertices[members], distance[members].max()
+        overlap = (high >= tile_vertices.min(axis=0) - reach) & (low <= tile_vertices.max(axis=0) + reach)
+        close_faces = np.flatnonzero(overlap.all(axis=1))
+        nearest_face, bary[members] = find_nearest(corner[close_faces], tile_vertices)
+        owner[members] = close_faces[nearest_face]
     return owner, bary
 
 
-def _bend(points: Floats, close: Ints, nodes: Ints, bary: Floats) -> sp.csr_array:
+def _bend(points: Floats, close_faces: Ints, nodes: Ints, bary: Floats) -> sp.csr_array:
     """(V, N) what the quadratic motion adds to the linear one: 4 b_i b_j (g_i - g_j) . (x_j - x_i) / 8."""
     edge = points[np.roll(nodes, -1, axis=1)] - points[nodes]  # (V, 3, 3) from corner i to j, the next one
     part = 0.5 * (bary * np.roll(bary, -1, axis=1))[..., None] * edge
     part -= np.roll(part, 1, axis=1)  # that of g_j
     x, y, z = (
         sparse_rows(part[..., d], nodes, len(points)) @ gradient
-        for d, gradient in enumerate(_gradient(points, close))
+        for d, gradient in enumerate(_gradient(points, close_faces))
     )
     return sp.csr_array(x + y + z)
 
@@ -118,7 +120,7 @@ def _gradient(points: Floats, faces: Ints) -> list[sp.csr_array]:
     return [sp.coo_array((values[..., d].ravel(), place), shape=size).tocsr() for d in range(3)]
 
 
-def _rotations(rest: Floats, now: Floats, faces: Ints) -> Floats:
+def _find_rotations(rest: Floats, deformed: Floats, faces: Ints) -> Floats:
     """Rotations (N, 3, 3) at nodes: nearest to the mean gradient of motion in the faces around them."""
 
     def frames(points: Floats) -> Floats:
@@ -127,14 +129,14 @@ def _rotations(rest: Floats, now: Floats, faces: Ints) -> Floats:
         size = np.sqrt(np.maximum(np.linalg.norm(normal, axis=1), 1e-300))
         return np.stack([b - a, c - a, normal / size[:, None]], axis=2)
 
-    gradient = frames(now) @ np.linalg.inv(frames(rest))
-    whole = np.zeros((len(rest), 3, 3))
+    gradient = frames(deformed) @ np.linalg.inv(frames(rest))
+    gradient_sum = np.zeros((len(rest), 3, 3))
     used = np.unique(faces)
     for k in range(3):
-        np.add.at(whole, faces[:, k], gradient)
-    left, _, right = np.linalg.svd(whole[used])
+        np.add.at(gradient_sum, faces[:, k], gradient)
+    left, _, right = np.linalg.svd(gradient_sum[used])
     flip = np.linalg.det(left @ right) < 0
     left[flip, :, 2] *= -1
-    turns = np.broadcast_to(np.eye(3), whole.shape).copy()
-    turns[used] = left @ right
-    return turns
+    rotations = np.broadcast_to(np.eye(3), gradient_sum.shape).copy()
+    rotations[used] = left @ right
+    return rotations

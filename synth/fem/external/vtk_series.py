@@ -17,7 +17,7 @@ from synth.geometry.skin import TRIANGLE
 from synth.system import checked_file
 from synth.system.series_files import COLLECTIONS, LARGEST_STATE, read_collection
 
-MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
+MOTION_NAMES = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {
     ".frd": "ccx2paraview FILE vtu", ".xdmf": "pip install meshio; meshio convert FILE OUT.vtu per step",
     ".exo": "save as PVD in ParaView", ".e": "save as PVD in ParaView", ".odb": "save as VTU by odb2vtk",
@@ -35,23 +35,23 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
     missing, and what `find_surface` and `assemble` refuse.
     """
     files, times = list_states(source)
-    first = _read(files[0])
-    surface = find_surface(first.points, first.cells, files[0])
-    fields = [name for name, values in first.point_data.items() if values.parts == 3]
-    named = [name for name in fields if name.lower() in MOVED]
-    field = named[0] if len(named) == 1 else None  # else the points themselves move
+    rest = _read(files[0])
+    surface = find_surface(rest.points, rest.cells, files[0])
+    fields = [name for name, values in rest.point_data.items() if values.parts == 3]
+    matches = [name for name in fields if name.lower() in MOTION_NAMES]
+    field = matches[0] if len(matches) == 1 else None  # else the points themselves move
     load, per_area = force_field(force, fields, files[0])
 
     def states() -> Iterator[State]:
         for k, file in enumerate(files):
-            state = first if k == 0 else _read(file)
-            same = [np.array_equal(state.cells.get(kind, []), one) for kind, one in first.cells.items()]
-            if not all(same) or len(state.cells) > len(same) or len(state.points) != len(first.points):
+            state = rest if k == 0 else _read(file)
+            is_same = [np.array_equal(state.cells.get(kind, []), nodes) for kind, nodes in rest.cells.items()]
+            if not all(is_same) or len(state.cells) > len(is_same) or len(state.points) != len(rest.points):
                 what = f"its mesh is not that of {files[0].name}; remeshing can't be followed"
                 raise UserError(f"{file}: {what}")
-            moved = _values(state, field, file) if field else state.points - first.points
-            given = _values(state, load, file) if load else None
-            yield State(file, times[k] if times else state.time, moved, given)
+            displacement = _read_field(state, field, file) if field else state.points - rest.points
+            nodal_force = _read_field(state, load, file) if load else None
+            yield State(file, times[k] if times else state.time, displacement, nodal_force)
 
     return assemble(source, surface, units, len(files), states(), fields, per_area)
 
@@ -63,12 +63,12 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     if source.suffix in COLLECTIONS:
         files, times = zip(*read_collection(source), strict=True)
         return list(files), list(times)
-    every = list(source.iterdir() if source.is_dir() else source.parent.glob(source.name))
-    lists = [file for file in every if file.suffix in COLLECTIONS]
+    entries = list(source.iterdir() if source.is_dir() else source.parent.glob(source.name))
+    lists = [file for file in entries if file.suffix in COLLECTIONS]
     if len(lists) == 1:
         return list_states(lists[0])
-    members = [file for file in every if file.suffix[1:] in SUFFIXES]
-    members = members or [file for file in every if file.suffix[1:].lower() in SURFACES]
+    members = [file for file in entries if file.suffix[1:] in SUFFIXES]
+    members = members or [file for file in entries if file.suffix[1:].lower() in SURFACES]
     stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in members})
     if len(stems) > 1:
         raise UserError(f"{source}: files of several series, {', '.join(stems[:3])}; choose one of these")
@@ -79,8 +79,8 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
             f"{source}: no series; two numbered files at least ({', '.join((*SUFFIXES, *SURFACES))})"
         )
     steps = np.diff([number for number, _ in order])
-    if (odd := np.flatnonzero(steps != steps.min())).size:
-        before, after = (order[odd[0] + k][1].name for k in (0, 1))
+    if (gaps := np.flatnonzero(steps != steps.min())).size:
+        before, after = (order[gaps[0] + k][1].name for k in (0, 1))
         raise UserError(f"{source}: a file between {before} and {after} is missing")
     return [file for _, file in order], None
 
@@ -94,7 +94,7 @@ def _read(file: Path) -> MeshFile:
         return read_mesh(data)
 
 
-def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[str | None, bool]:
+def force_field(force: str | None, fields: Sequence[str], file: Path) -> tuple[str | None, bool]:
     """Name of the field in `mechanics.force`, and whether it is one per area; None if there is no force.
 
     UserError: it is not nodal:NAME or traction:NAME of a field.
@@ -103,12 +103,12 @@ def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[
         return None, False
     kind, _, name = force.partition(":")
     if kind not in ("nodal", "traction") or name not in fields:
-        has = f"{where.name} has {', '.join(fields) or 'no vectors'}{did_you_mean(name, fields)}"
-        raise UserError(f"mechanics.force {force}: nodal:NAME, traction:NAME or a table (.csv); {has}")
+        available = f"{file.name} has {', '.join(fields) or 'no vectors'}{did_you_mean(name, fields)}"
+        raise UserError(f"mechanics.force {force}: nodal:NAME, traction:NAME or a table (.csv); {available}")
     return name, kind == "traction"
 
 
-def _values(state: MeshFile, name: str, file: Path) -> Floats:
+def _read_field(state: MeshFile, name: str, file: Path) -> Floats:
     values = state.point_data.get(name)
     if values is None or values.parts != 3:
         raise UserError(f"{file}: has no vectors {name} at its points")

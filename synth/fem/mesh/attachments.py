@@ -31,26 +31,26 @@ def springs(points: Floats, cells: Ints, attachments: Sequence[Attachment]) -> s
     corner = points[cells[:, :4]]
     value, share = shape(_SAMPLES), bary_slope(corner)[1] / len(_SAMPLES)
     for k, attachment in enumerate(attachments):
-        near = np.linalg.norm(corner - attachment.point, axis=2).min(axis=1)
+        distance = np.linalg.norm(corner - attachment.point, axis=2).min(axis=1)
         reach = np.ptp(corner, axis=1).max(axis=1) * np.sqrt(3) + attachment.radius_mm
-        chosen = np.flatnonzero(near <= reach)
-        held = within(attachment, np.einsum("qc,mcd->mqd", _SAMPLES, corner[chosen]))
-        touched = held.any(axis=1)
-        if not touched.any():
+        chosen = np.flatnonzero(distance <= reach)
+        coverage = contains(attachment, np.einsum("qc,mcd->mqd", _SAMPLES, corner[chosen]))
+        is_touched = coverage.any(axis=1)
+        if not is_touched.any():
             raise UserError(f"anatomy.attachments: number {k} holds no tissue; check its point and radius_mm")
-        held, mine = held[touched], cells[chosen[touched]]
-        across = attachment.radius_mm if attachment.normal is None else attachment.thickness_mm
-        weight = held * (FIRM_PER_MM / across * share[chosen[touched]])[:, None]
+        coverage, held_cells = coverage[is_touched], cells[chosen[is_touched]]
+        width_mm = attachment.radius_mm if attachment.normal is None else attachment.thickness_mm
+        weight = coverage * (FIRM_PER_MM / width_mm * share[chosen[is_touched]])[:, None]
         local = np.einsum("mq,qi,qj->mij", weight, value, value, optimize=True)
-        total = total + scatter(local, mine, len(points))
+        total = total + scatter(local, held_cells, len(points))
     return sp.csr_array(total)
 
 
-def within(attachment: Attachment, at: Floats) -> Mask:
+def contains(attachment: Attachment, positions: Floats) -> Mask:
     """Mask (...) of the points (..., 3) mm that an attachment holds."""
-    away = at - np.asarray(attachment.point)
-    inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm
+    offset = positions - np.asarray(attachment.point)
+    inside = np.linalg.norm(offset, axis=-1) <= attachment.radius_mm
     if attachment.normal is not None:
         normal = np.asarray(attachment.normal) / np.linalg.norm(attachment.normal)
-        inside &= np.abs(away @ normal) <= 0.5 * attachment.thickness_mm
+        inside &= np.abs(offset @ normal) <= 0.5 * attachment.thickness_mm
     return np.asarray(inside)

@@ -41,9 +41,9 @@ def shape_slope(bary: Floats) -> Floats:
 
     The first is 1 less the others.
     """
-    one, (first, second) = np.eye(bary.shape[-1]), _ends(bary)
-    sides = 4 * (bary[..., first, None] * one[second] + bary[..., second, None] * one[first])
-    slope = np.concatenate([one * (4 * bary - 1)[..., None, :], sides], axis=-2)
+    identity, (first, second) = np.eye(bary.shape[-1]), _ends(bary)
+    sides = 4 * (bary[..., first, None] * identity[second] + bary[..., second, None] * identity[first])
+    slope = np.concatenate([identity * (4 * bary - 1)[..., None, :], sides], axis=-2)
     return np.asarray(slope[..., 1:] - slope[..., :1])
 
 
@@ -60,15 +60,15 @@ def scatter_blocks(local: Floats, cells: Array, nodes: int) -> sp.csr_array:
     As `scatter` over all degrees of freedom, but a ninth of the entries are sorted.
     """
     pair = (cells[:, :, None].astype(np.int64) * nodes + cells[:, None, :]).ravel()
-    kept, place = np.unique(pair, return_inverse=True)
-    every = np.arange(len(pair) + 1)
-    sums = sp.csc_array((np.ones(len(pair)), place, every), shape=(len(kept), len(pair)))
+    unique_pairs, inverse = np.unique(pair, return_inverse=True)
+    indptr = np.arange(len(pair) + 1)
+    sums = sp.csc_array((np.ones(len(pair)), inverse, indptr), shape=(len(unique_pairs), len(pair)))
     blocks = (sums @ local.swapaxes(2, 3).reshape(-1, 9)).reshape(-1, 3, 3)
-    first = np.append(0, np.cumsum(np.bincount(kept // nodes, minlength=nodes))).astype(np.int32)
-    columns = (kept % nodes).astype(np.int32)
+    first = np.append(0, np.cumsum(np.bincount(unique_pairs // nodes, minlength=nodes))).astype(np.int32)
+    columns = (unique_pairs % nodes).astype(np.int32)
     size = 3 * nodes
-    whole: sp.csr_array = sp.bsr_array((blocks, columns, first), shape=(size, size)).tocsr()
-    return whole
+    matrix: sp.csr_array = sp.bsr_array((blocks, columns, first), shape=(size, size)).tocsr()
+    return matrix
 
 
 def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
@@ -102,11 +102,11 @@ class Quadrature:
     nodes: int  # N, number of nodes
 
 
-def quadrature(points: Floats, cells: Ints, at: Floats = TET_POINTS) -> Quadrature:
+def quadrature(points: Floats, cells: Ints, bary: Floats = TET_POINTS) -> Quadrature:
     """The quadrature of nodes (N, 3) mm and cells (M, 10), whose sides may be curved, at (Q, 4) barycentric
     points of equal weight in every element."""
-    gradient, determinant = gradients(points[cells], at)
-    weight = determinant / (6 * len(at))
+    gradient, determinant = gradients(points[cells], bary)
+    weight = determinant / (6 * len(bary))
     return Quadrature(cells.astype(np.int32), np.ascontiguousarray(gradient), weight, len(points))
 
 

@@ -30,26 +30,26 @@ def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tu
     cells = cells[(value[cells] > 0).any(axis=1)]
     pairs, _ = edges_of(cells)
     pairs = pairs[value[pairs[:, 0]] != value[pairs[:, 1]]]
-    where = _crossing(points, pairs, value, inside)
-    _snap(points, value, pairs, where)
+    crossing = _find_crossings(points, pairs, value, inside)
+    _snap(points, value, pairs, crossing)
 
     # A new corner on each edge that is still cut.
-    cut = value[pairs[:, 0]] * value[pairs[:, 1]] < 0
-    pairs = pairs[cut]
-    where = _crossing(points, pairs, value, inside)
-    new = points[pairs[:, 0]] + where[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
-    corner = {(int(a), int(b)): len(points) + i for i, (a, b) in enumerate(pairs)}
-    points = np.vstack([points, new])
+    is_cut = value[pairs[:, 0]] * value[pairs[:, 1]] < 0
+    pairs = pairs[is_cut]
+    crossing = _find_crossings(points, pairs, value, inside)
+    cut_points = points[pairs[:, 0]] + crossing[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
+    cut_corners = {(int(a), int(b)): len(points) + i for i, (a, b) in enumerate(pairs)}
+    points = np.vstack([points, cut_points])
 
     sign = value[cells]
-    whole = (sign >= 0).all(axis=1) & (sign > 0).any(axis=1)
-    mixed = (sign < 0).any(axis=1) & (sign > 0).any(axis=1)
-    pieces = [piece for cell in cells[mixed] for piece in _pieces(cell, value, corner)]
-    cells = np.vstack([cells[whole], np.array(pieces, np.int64).reshape(-1, 4)])
-    return _sound(points, cells)
+    is_inner = (sign >= 0).all(axis=1) & (sign > 0).any(axis=1)
+    is_mixed = (sign < 0).any(axis=1) & (sign > 0).any(axis=1)
+    pieces = [piece for cell in cells[is_mixed] for piece in _pieces(cell, value, cut_corners)]
+    cells = np.vstack([cells[is_inner], np.array(pieces, np.int64).reshape(-1, 4)])
+    return _clean(points, cells)
 
 
-def _crossing(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats], Floats]) -> Floats:
+def _find_crossings(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats], Floats]) -> Floats:
     """Crossing of each edge with the surface, (E,) from 0 at its first corner to 1."""
     first, side = points[pairs[:, 0]], points[pairs[:, 1]] - points[pairs[:, 0]]
     ends = np.zeros(len(pairs)), np.ones(len(pairs))
@@ -59,53 +59,53 @@ def _crossing(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats
 def halve(
     inside: Callable[[Floats], Floats],
     start: Floats,
-    way: Floats,
-    begins: Mask,
+    ray: Floats,
+    is_inside: Mask,
     low: Floats,
     high: Floats,
     times: int,
 ) -> Floats:
-    """Share (n,) between `low` and `high` (n,) at which `start` + share * `way`, (n, 3) mm, crosses the
-    surface, by bisection; `begins`: (n,) whether `low` is inside."""
+    """Share (n,) between `low` and `high` (n,) at which `start` + share * `ray`, (n, 3) mm, crosses the
+    surface, by bisection; `is_inside`: (n,) whether `low` is inside."""
     for _ in range(times):
         middle = 0.5 * (low + high)
-        before = (inside(start + middle[:, None] * way) > 0) == begins
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
+        is_before = (inside(start + middle[:, None] * ray) > 0) == is_inside
+        low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
     return 0.5 * (low + high)
 
 
-def _snap(points: Floats, value: Ints, pairs: Ints, where: Floats) -> None:
+def _snap(points: Floats, value: Ints, pairs: Ints, crossing: Floats) -> None:
     """Moves corners close to the surface onto it, in place, the closest first; their value becomes 0."""
     ends = np.concatenate([pairs[:, 0], pairs[:, 1]])
-    share = np.concatenate([where, 1 - where])
+    share = np.concatenate([crossing, 1 - crossing])
     length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
-    target = points[pairs[:, 0]] + where[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
-    near = np.flatnonzero(share < _SNAP)
-    order = near[np.lexsort((near, share[near] * np.tile(length, 2)[near]))]
+    target = points[pairs[:, 0]] + crossing[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
+    candidates = np.flatnonzero(share < _SNAP)
+    order = candidates[np.lexsort((candidates, share[candidates] * np.tile(length, 2)[candidates]))]
     _, first = np.unique(ends[order], return_index=True)
     chosen = order[np.sort(first)]
     points[ends[chosen]] = target[chosen % len(pairs)]
     value[ends[chosen]] = 0
 
 
-def _pieces(cell: Ints, value: Ints, corner: dict[tuple[int, int], int]) -> list[list[int]]:
+def _pieces(cell: Ints, value: Ints, cut_corners: dict[tuple[int, int], int]) -> list[list[int]]:
     """The inner part of a cut tetrahedron, as tetrahedra of any orientation."""
 
-    def on(a: int, b: int) -> int:
-        return corner[(a, b) if a < b else (b, a)]
+    def cut(a: int, b: int) -> int:
+        return cut_corners[(a, b) if a < b else (b, a)]
 
     ins = [int(v) for v in cell if value[v] > 0]
     zero = [int(v) for v in cell if value[v] == 0]
     outs = [int(v) for v in cell if value[v] < 0]
     if len(ins) == 1:
-        return [[ins[0], *zero, *(on(ins[0], o) for o in outs)]]
+        return [[ins[0], *zero, *(cut(ins[0], o) for o in outs)]]
     if len(ins) == 3:  # a corner is off: what is left is a prism
-        return _prism([ins, [on(i, outs[0]) for i in ins]])
+        return _prism([ins, [cut(i, outs[0]) for i in ins]])
     a, b = ins
     if len(outs) == 2:
-        return _prism([[a, on(a, outs[0]), on(a, outs[1])], [b, on(b, outs[0]), on(b, outs[1])]])
+        return _prism([[a, cut(a, outs[0]), cut(a, outs[1])], [b, cut(b, outs[0]), cut(b, outs[1])]])
     # Two inside, one on the surface, one outside: a pyramid over a quadrilateral, its top on the surface.
-    return _pyramid([a, b, on(b, outs[0]), on(a, outs[0])], zero[0])
+    return _pyramid([a, b, cut(b, outs[0]), cut(a, outs[0])], zero[0])
 
 
 def _pyramid(base: list[int], top: int) -> list[list[int]]:
@@ -125,7 +125,7 @@ def _prism(ends: list[list[int]]) -> list[list[int]]:
     return [[a, d, e, f], *_pyramid([b, c, f, e], a)]
 
 
-def _sound(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
+def _clean(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
     """The largest connected part of the cells, positively oriented, without flat cells and unused corners."""
     if len(cells) == 0:
         return np.zeros((0, 3)), np.zeros((0, 4), np.int64)

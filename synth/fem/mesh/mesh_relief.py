@@ -38,16 +38,16 @@ class HeightMap:
     height: Floats  # (n, n) mm, on a grid from corner to corner of the square; rows go with y, columns with x
     extent_mm: float  # side of the square
 
-    def over(self, ground: Field) -> Field:
+    def blend_into(self, ground: Field) -> Field:
         """The map within its inner circle, passing into another field beyond."""
 
         def height(xy: Floats) -> Floats:
             half, last = self.extent_mm / 2, len(self.height) - 1
-            at = (xy / self.extent_mm + 0.5) * last
-            known = map_coordinates(self.height, [at[:, 1], at[:, 0]], order=1, mode="nearest")
+            pixels = (xy / self.extent_mm + 0.5) * last
+            map_height = map_coordinates(self.height, [pixels[:, 1], pixels[:, 0]], order=1, mode="nearest")
             s = np.clip((half - np.hypot(xy[:, 0], xy[:, 1])) / _FADE_MM, 0, 1)
-            below = ground(xy)
-            return np.asarray(below + s * s * (3 - 2 * s) * (known - below))
+            ground_height = ground(xy)
+            return np.asarray(ground_height + s * s * (3 - 2 * s) * (map_height - ground_height))
 
         return height
 
@@ -63,47 +63,50 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
     sinking = 1 + points[:, 2] / -points[:, 2].min()
     base = points + np.outer(ground(points[:, :2]) * sinking, [0.0, 0.0, 1.0])
     place = np.einsum("qc,fcd->fqd", _PLACES, points[faces[:, :3], :2])
-    top, wanted = _fit_heights(points, faces, height(place.reshape(-1, 2)).reshape(place.shape[:2]))
+    top, top_height = _fit_heights(points, faces, height(place.reshape(-1, 2)).reshape(place.shape[:2]))
     rise = np.zeros(len(points))
-    first = top[top < corners]
-    rise[top] = wanted - base[top, 2]
-    below = np.setdiff1d(np.arange(corners), first)
-    rise[below] = sinking[below] * LinearNDInterpolator(points[first, :2], rise[first])(points[below, :2])
+    upper = top[top < corners]
+    rise[top] = top_height - base[top, 2]
+    lower = np.setdiff1d(np.arange(corners), upper)
+    rise[lower] = sinking[lower] * LinearNDInterpolator(points[upper, :2], rise[upper])(points[lower, :2])
 
     ends = np.zeros((len(points), 2), np.int64)
     ends[:corners] = np.arange(corners)[:, None]
     ends[cells[:, 4:]] = cells[:, EDGES]
-    whole = base[:, 2] + rise
-    bulge = np.where(np.isin(np.arange(len(points)), top), whole - whole[ends].mean(axis=1), 0.0)
-    raised, changed = base.copy(), np.arange(len(cells))
-    least = np.minimum(_SOUND, quality(base[cells[:, :4]])) - 1e-12
+    z = base[:, 2] + rise
+    bulge = np.where(np.isin(np.arange(len(points)), top), z - z[ends].mean(axis=1), 0.0)
+    bent_points, changed_cells = base.copy(), np.arange(len(cells))
+    floor = np.minimum(_SOUND, quality(base[cells[:, :4]])) - 1e-12
     for _ in range(_TURNS):
-        raised[:, 2] = (base[:, 2] + rise)[ends].mean(axis=1) + bulge
-        steep = changed[quality(raised[cells[changed, :4]]) < least[changed]]
-        bent = changed[jacobians(raised, cells[changed]).min(axis=1) < _UNBENT]
-        if len(steep) + len(bent) == 0:
-            return raised
+        bent_points[:, 2] = (base[:, 2] + rise)[ends].mean(axis=1) + bulge
+        steep_cells = changed_cells[quality(bent_points[cells[changed_cells, :4]]) < floor[changed_cells]]
+        bent_cells = changed_cells[jacobians(bent_points, cells[changed_cells]).min(axis=1) < _UNBENT]
+        if len(steep_cells) + len(bent_cells) == 0:
+            return bent_points
         # An element whose corners rise alike has the shape it had. Levelling a steep one hands part of the
         # slope to its neighbours; lowering its corners instead would leave cliffs around it.
-        own = cells[steep, :4].ravel()
-        count, level = np.bincount(own), np.bincount(own, np.repeat(rise[cells[steep, :4]].mean(axis=1), 4))
-        moved = np.flatnonzero(count)
-        rise[moved] = 0.5 * (rise[moved] + level[moved] / count[moved])
-        bulge[np.unique(cells[bent])] *= 0.7
-        touched = np.union1d(moved, cells[bent])
-        changed = np.flatnonzero(np.isin(cells, touched).any(axis=1))
+        nodes = cells[steep_cells, :4].ravel()
+        count, level = (
+            np.bincount(nodes),
+            np.bincount(nodes, np.repeat(rise[cells[steep_cells, :4]].mean(axis=1), 4)),
+        )
+        levelled_nodes = np.flatnonzero(count)
+        rise[levelled_nodes] = 0.5 * (rise[levelled_nodes] + level[levelled_nodes] / count[levelled_nodes])
+        bulge[np.unique(cells[bent_cells])] *= 0.7
+        touched_nodes = np.union1d(levelled_nodes, cells[bent_cells])
+        changed_cells = np.flatnonzero(np.isin(cells, touched_nodes).any(axis=1))
     return base
 
 
-def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Floats]:
+def _fit_heights(points: Floats, faces: Ints, heights: Floats) -> tuple[Ints, Floats]:
     """Nodes (K,) of faces, and their heights (K,) mm by least squares on heights (F, 28) mm at `_PLACES`."""
     corner = points[faces[:, :3], :2]
     side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = 0.5 * np.abs(side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0])
     value = shape(_PLACES)
     local = np.einsum("f,qi,qj->fij", area, value, value)
-    used, at = np.unique(faces, return_inverse=True)
-    at = at.reshape(faces.shape)
-    matrix = scatter(local, at, len(used)).tocsc()
-    target = np.bincount(at.ravel(), np.einsum("f,qi,fq->fi", area, value, wanted).ravel(), len(used))
-    return used, np.asarray(spsolve(matrix, target))
+    nodes, indices = np.unique(faces, return_inverse=True)
+    indices = indices.reshape(faces.shape)
+    matrix = scatter(local, indices, len(nodes)).tocsc()
+    target = np.bincount(indices.ravel(), np.einsum("f,qi,fq->fi", area, value, heights).ravel(), len(nodes))
+    return nodes, np.asarray(spsolve(matrix, target))

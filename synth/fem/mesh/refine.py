@@ -21,11 +21,11 @@ def refine(points: Floats, cells: Ints, size: Callable[[Floats], Floats], target
     conforms, a few per cent more; the first N points stay. `size`: wanted edge length at (n, 3) mm, up to a
     factor."""
     while len(cells) < target:
-        need = longest(points, cells) / size(points[cells].mean(axis=1))
+        relative_size = longest(points, cells) / size(points[cells].mean(axis=1))
         # Marking only the worst keeps the grading even; a handful at a time would take hundreds of rounds.
         allowance = max(1, (target - len(cells)) // 6)
-        worst = np.flatnonzero(need >= 0.8 * need.max())
-        worst = worst[np.argsort(-need[worst], kind="stable")][:allowance]
+        worst = np.flatnonzero(relative_size >= 0.8 * relative_size.max())
+        worst = worst[np.argsort(-relative_size[worst], kind="stable")][:allowance]
         points, cells = bisect(points, cells, worst)
     return points, cells
 
@@ -48,38 +48,38 @@ def edges_of(cells: Ints) -> tuple[Ints, Ints]:
 def bisect(points: Floats, cells: Ints, chosen: Ints) -> tuple[Floats, Ints]:
     """Bisection of a mesh of points (N, 3) mm and cells (M, 4): the chosen cells (K,) are halved at their
     longest edges, and as many others as conformity requires."""
-    pairs, of = edges_of(cells)
+    pairs, cell_edges = edges_of(cells)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # One order of all edges: ties must fall alike in neighbours, or their face would be cut in two ways.
     rank = np.empty(len(pairs), np.int64)
     rank[np.lexsort((pairs[:, 1], pairs[:, 0], np.round(length, 9)))] = np.arange(len(pairs))
-    top = np.take_along_axis(of, rank[of].argmax(axis=1)[:, None], axis=1)[:, 0]
+    longest_edge = np.take_along_axis(cell_edges, rank[cell_edges].argmax(axis=1)[:, None], axis=1)[:, 0]
 
     marked = np.zeros(len(pairs), bool)
-    marked[top[chosen]] = True
+    marked[longest_edge[chosen]] = True
     while True:
-        closed = marked.copy()
-        closed[top[marked[of].any(axis=1)]] = True
-        if (closed == marked).all():
+        closure = marked.copy()
+        closure[longest_edge[marked[cell_edges].any(axis=1)]] = True
+        if (closure == marked).all():
             break
-        marked = closed
+        marked = closure
 
     split = np.flatnonzero(marked)
     stride = len(points) + len(split)
-    key, touched = pairs[split] @ [stride, 1], marked[of].any(axis=1)
+    key, touched = pairs[split] @ [stride, 1], marked[cell_edges].any(axis=1)
     done, waiting = [cells[~touched]], cells[touched]
     while len(waiting):
-        wanted = np.sort(waiting[:, EDGES], axis=2) @ [stride, 1]
-        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-        order = np.where(key[at] == wanted, rank[split[at]], -1)
-        best, row = order.argmax(axis=1), np.arange(len(waiting))
-        cut = order[row, best] >= 0
+        edge_keys = np.sort(waiting[:, EDGES], axis=2) @ [stride, 1]
+        indices = np.minimum(np.searchsorted(key, edge_keys), len(key) - 1)
+        order = np.where(key[indices] == edge_keys, rank[split[indices]], -1)
+        edge, row = order.argmax(axis=1), np.arange(len(waiting))
+        cut = order[row, edge] >= 0
         done.append(waiting[~cut])
-        best, row = best[cut], row[: cut.sum()]
-        new = len(points) + at[cut, best]
+        edge, row = edge[cut], row[: cut.sum()]
+        new_nodes = len(points) + indices[cut, edge]
         # Putting the midpoint in the place of one end keeps the orientation.
-        one, other = waiting[cut], waiting[cut]
-        one[row, EDGES[best, 0]] = other[row, EDGES[best, 1]] = new
-        waiting = np.concatenate([one, other])
-    halves = 0.5 * (points[pairs[split, 0]] + points[pairs[split, 1]])
-    return np.vstack([points, halves]), np.concatenate(done)
+        first_half, second_half = waiting[cut], waiting[cut]
+        first_half[row, EDGES[edge, 0]] = second_half[row, EDGES[edge, 1]] = new_nodes
+        waiting = np.concatenate([first_half, second_half])
+    midpoints = 0.5 * (points[pairs[split, 0]] + points[pairs[split, 1]])
+    return np.vstack([points, midpoints]), np.concatenate(done)

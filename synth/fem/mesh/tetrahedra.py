@@ -82,15 +82,15 @@ def block(
     size = np.asarray(size_mm)
     fall = -dome(np.array([size[:2] / 2]), dome_mm)[0]
     if fall > 0.8 * size[2]:
-        steep = f"the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
-        raise UserError(f"anatomy.dome_mm: {steep}")
+        fault = f"the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
+        raise UserError(f"anatomy.dome_mm: {fault}")
     points, cells = bricks(size, tets / 60)
     points, cells = refine(points, cells, _grading(opening_mm, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
     points, cells = with_midsides(points, cells)
     faces, ground = boundary(cells), partial(dome, radius_mm=dome_mm)
     top = faces[(points[faces, 2] > -1e-9).all(axis=1)]
-    points = raise_top(points, cells, top, ground, ground if height is None else height.over(ground))
+    points = raise_top(points, cells, top, ground, ground if height is None else height.blend_into(ground))
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
     return _hold(points, cells, wall, opening_mm, attachments, slips)
 
@@ -126,8 +126,8 @@ def dome(xy: Floats, radius_mm: float) -> Floats:
 
 def with_midsides(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
     """Adds the midside nodes: cells (M, 4) become (M, 10)."""
-    pairs, of = edges_of(cells)
-    return np.vstack([points, points[pairs].mean(axis=1)]), np.hstack([cells, len(points) + of])
+    pairs, cell_edges = edges_of(cells)
+    return np.vstack([points, points[pairs].mean(axis=1)]), np.hstack([cells, len(points) + cell_edges])
 
 
 def boundary(cells: Ints) -> Ints:
@@ -135,17 +135,17 @@ def boundary(cells: Ints) -> Ints:
 
     (F, 3) corners of cells (M, 4); of cells (M, 10) also midsides 01, 02, 12, (F, 6).
     """
-    owner, off = outer_faces(cells)
+    owner, apex = outer_faces(cells)
     local = FACES if cells.shape[1] == 4 else np.hstack([FACES, _MIDSIDES])
-    return np.asarray(cells[owner[:, None], local[off]])
+    return np.asarray(cells[owner[:, None], local[apex]])
 
 
 def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
     """Tetrahedra (F,) of the faces with one tetrahedron, and their corners (F,) that are off these faces."""
     key = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    alone = np.sort(first[count == 1])
-    return alone // 4, alone % 4
+    outer = np.sort(first[count == 1])
+    return outer // 4, outer % 4
 
 
 def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], Floats]:
@@ -156,14 +156,14 @@ def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], 
     under the whole opening.
     """
 
-    def size(at: Floats) -> Floats:
+    def size(xyz: Floats) -> Floats:
         if not focus:
-            aside = np.maximum(np.hypot(at[:, 0], at[:, 1]) - opening_mm, 0)
-            return np.asarray((1 + np.hypot(aside, at[:, 2]) / (0.5 * opening_mm)) ** 2)
-        deep = (_DEPTH * at[:, 2]) ** 2
-        far = [np.sqrt((at[:, 0] - x) ** 2 + (at[:, 1] - y) ** 2 + deep) for x, y, _ in focus]
-        away = [np.maximum(_EVEN * a, one) for one, (*_, a) in zip(far, focus, strict=True)]
-        return np.asarray(np.min(away, axis=0))
+            distance = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]) - opening_mm, 0)
+            return np.asarray((1 + np.hypot(distance, xyz[:, 2]) / (0.5 * opening_mm)) ** 2)
+        depth_sq = (_DEPTH * xyz[:, 2]) ** 2
+        distances = [np.sqrt((xyz[:, 0] - x) ** 2 + (xyz[:, 1] - y) ** 2 + depth_sq) for x, y, _ in focus]
+        sizes = [np.maximum(_EVEN * a, distance) for distance, (*_, a) in zip(distances, focus, strict=True)]
+        return np.asarray(np.min(sizes, axis=0))
 
     return size
 
@@ -176,9 +176,9 @@ def bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
     axes = [np.linspace(-size[i] / 2, size[i] / 2, n[i] + 1) for i in (0, 1)]
     axes.append(np.linspace(-size[2], 0, n[2] + 1))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    at = np.arange(len(grid)).reshape(n + 1)
+    node_grid = np.arange(len(grid)).reshape(n + 1)
     corners = product((0, 1), repeat=3)
-    cube = [at[x : x + n[0], y : y + n[1], z : z + n[2]].ravel() for z, y, x in corners]
+    cube = [node_grid[x : x + n[0], y : y + n[1], z : z + n[2]].ravel() for z, y, x in corners]
     cells = np.stack(cube, axis=1)[:, _KUHN].reshape(-1, 4)
     volume = bary_slope(grid[cells])[1]
     cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
@@ -187,27 +187,27 @@ def bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
 
 def _fill(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
     """Graded tetrahedra inside a surface, about as many as wanted after up to four tries."""
-    turns = winding.prepare(*brain.shape)
+    winding_number = winding.prepare(*brain.shape)
     low, high = brain.shape.vertices.min(axis=0), brain.shape.vertices.max(axis=0)
     size = 1.1 * (high - low)
 
-    def grade(at: Floats) -> Floats:
+    def grade(xyz: Floats) -> Floats:
         """The grading, coarser well outside the surface, where refining gains nothing."""
-        outside = turns(at) < 0.01
-        far = np.linalg.norm(at, axis=1) > _ALL_MM
-        return np.asarray(grading(at) * np.where(outside & far, 4.0, 1.0))
+        is_outside = winding_number(xyz) < 0.01
+        is_far = np.linalg.norm(xyz, axis=1) > _ALL_MM
+        return np.asarray(grading(xyz) * np.where(is_outside & is_far, 4.0, 1.0))
 
     lattice = 2 * tets
     for _ in range(4):
         points, cells = bricks(size, lattice / 18)
         points += 0.5 * (low + high) + [0, 0, 0.5 * size[2]]
         points, cells = refine(points, cells, grade, lattice)
-        points, cells = stuff(points, cells, lambda at: turns(at) - 0.5)
+        points, cells = stuff(points, cells, lambda xyz: winding_number(xyz) - 0.5)
         if 0.9 * tets <= len(cells) <= 1.1 * tets or len(cells) == 0:
             break
         lattice = int(lattice * tets / len(cells))
     if len(cells):
-        points = fit(points, cells, boundary(cells), lambda at: turns(at) - 0.5)
+        points = fit(points, cells, boundary(cells), lambda xyz: winding_number(xyz) - 0.5)
     return points, cells
 
 
@@ -239,24 +239,24 @@ def _springs(
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = 0.5 * np.linalg.norm(facing, axis=1)
     place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
-    out = np.hypot(place[..., 0], place[..., 1]) - opening_mm
-    firm = np.clip(out / RIM_MM, 0, 1)
+    rim_distance = np.hypot(place[..., 0], place[..., 1]) - opening_mm
+    firmness = np.clip(rim_distance / RIM_MM, 0, 1)
     # Deep below lies the far side of the brain, which no opening exposes.
     deep = place[..., 2] < -2 * opening_mm
-    firm[deep] = 1
+    firmness[deep] = 1
     value = shape(TRI_POINTS)
-    pressed = FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
+    stiffness = FIRM_PER_MM * firmness * firmness * (3 - 2 * firmness) * area[:, None] * TRI_WEIGHTS
 
     def gather(part: Floats) -> sp.csr_array:
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))
 
     if not slips:
-        return gather(pressed), None
+        return gather(stiffness), None
     normal = facing / (2 * area)[:, None]
     slip = sp.csr_array((3 * len(points),) * 2)
     for i, j in product(range(3), repeat=2):
-        one = np.zeros((3, 3))
-        one[i, j] = 1
-        part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
-        slip = slip + sp.kron(gather(part), one, format="csr")
-    return gather(np.where(deep, pressed, 0)), sp.csr_array(slip)
+        unit = np.zeros((3, 3))
+        unit[i, j] = 1
+        part = np.where(deep, 0, stiffness) * (normal[:, i] * normal[:, j])[:, None]
+        slip = slip + sp.kron(gather(part), unit, format="csr")
+    return gather(np.where(deep, stiffness, 0)), sp.csr_array(slip)

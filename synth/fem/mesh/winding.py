@@ -29,10 +29,10 @@ class Winding:
     moment: Floats  # (C, 3) mm^2, area times normal
     sign: float  # -1 for a surface whose faces look inwards
 
-    def __call__(self, at: Floats) -> Floats:
+    def __call__(self, points: Floats) -> Floats:
         """Winding number at (n, 3) mm, (n,)."""
         clusters = self.corner, self.start, self.centre, self.radius, self.moment
-        return np.asarray(self.sign * _number(np.ascontiguousarray(at), *clusters))
+        return np.asarray(self.sign * _number(np.ascontiguousarray(points), *clusters))
 
 
 def prepare(vertices: Floats, faces: Array) -> Winding:
@@ -66,11 +66,11 @@ def prepare(vertices: Floats, faces: Array) -> Winding:
 
 @compiled
 def _number(
-    at: Floats, corner: Floats, start: Ints, centre: Floats, radius: Floats, moment: Floats
+    points: Floats, corner: Floats, start: Ints, centre: Floats, radius: Floats, moment: Floats
 ) -> Floats:
-    out = np.zeros(len(at))
-    for p in range(len(at)):
-        x, y, z = at[p, 0], at[p, 1], at[p, 2]
+    out = np.zeros(len(points))
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
         total = 0.0
         for c in range(len(centre)):
             a, b, d = centre[c, 0] - x, centre[c, 1] - y, centre[c, 2] - z

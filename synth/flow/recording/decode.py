@@ -113,14 +113,16 @@ class Decoder:
         """The downsampled frame, still without motion. UserError: its size is not the rest frame's."""
         height, width = picture.rgb.shape[:2]
         if (height, width) != self.rest.size:
-            known = f"{self.rest.size[1]} x {self.rest.size[0]}"
-            raise UserError(f"frame {picture.index} is {width} x {height} px, but the rest frame is {known}")
+            rest_size = f"{self.rest.size[1]} x {self.rest.size[0]}"
+            raise UserError(
+                f"frame {picture.index} is {width} x {height} px, but the rest frame is {rest_size}"
+            )
         rgb = shrink_picture(picture.rgb, self.rest.shrink)
         if picture.time_s is not None:
             self.faults.add_tracked(picture.time_s, picture.rgb, rgb)
         size, trusted = self.rest.tissue.shape, not self.rest.fault
-        none = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
-        return FrameMotion(*none, trusted, index=picture.index, time_s=picture.time_s, rgb=rgb)
+        no_motion = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
+        return FrameMotion(*no_motion, trusted, index=picture.index, time_s=picture.time_s, rgb=rgb)
 
     def _decode(self) -> Iterator[Picture]:
         pictures = iter(self._footage.pictures())
@@ -172,9 +174,10 @@ class Decoder:
     def _describe_rest(self, picture: Picture, shrink: int, least_columns: int) -> RestFrame:
         size = (picture.rgb.shape[0], picture.rgb.shape[1])
         shrink = shrink or max(1, size[1] // least_columns)
-        given, bars = self._footage.tissue, find_bars(picture.rgb)
-        tissue, findings = np.ones(size, bool) if given is None else given(size), [*self._footage.findings]
-        if given is not None and not findings and is_inside_out(tissue):
+        read_tissue, bars = self._footage.tissue, find_bars(picture.rgb)
+        tissue = np.ones(size, bool) if read_tissue is None else read_tissue(size)
+        findings = [*self._footage.findings]
+        if read_tissue is not None and not findings and is_inside_out(tissue):
             inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
             findings.append(Finding("warning", "tissue", inverted))
         if bars.any() and (self._footage.findings or (tissue & bars).any()):  # found tissue has none of them

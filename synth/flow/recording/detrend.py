@@ -27,12 +27,12 @@ class GatherMotion:
         if not frame.trusted or frame.is_rest:
             return frame
         assert frame.time_s is not None
-        parts, moved = [frame.flow], frame.motion
-        if moved is not None:
+        parts, motion = [frame.flow], frame.motion
+        if motion is not None:
             # The search uses the flow, because lateral motion in mm has the noise of depth.
-            parts += [moved.motion[..., 2:] / self._mm_per_px, moved.motion[..., :2] / self._mm_per_px]
-            across, along = (float(np.median(moved.deviation[..., k][self._rest.tissue])) for k in (0, 2))
-            self._depth_weights.append(across / max(along, 1e-9))
+            parts += [motion.motion[..., 2:] / self._mm_per_px, motion.motion[..., :2] / self._mm_per_px]
+            lateral, axial = (float(np.median(motion.deviation[..., k][self._rest.tissue])) for k in (0, 2))
+            self._depth_weights.append(lateral / max(axial, 1e-9))
         self._surface.add(frame.time_s, np.dstack(parts), frame.confidence)
         return frame
 
@@ -44,9 +44,11 @@ class GatherMotion:
             surface.depth_weight = min(1.0, float(np.median(self._depth_weights)))
         first_s = surface.time_s[0] if surface.time_s else 0.0
         rest_s = first_s if self._rest.time_s is None else self._rest.time_s
-        none = PulseSearch(None, np.zeros(0), None, is_living=False)
-        found = find_pulse(surface, rest_s, free_s) if may_pulsate else none
-        return replace(found, camera=find_path(surface, found.pulse)) if fills_picture else found
+        no_search = PulseSearch(None, np.zeros(0), None, is_living=False)
+        pulse_search = find_pulse(surface, rest_s, free_s) if may_pulsate else no_search
+        if not fills_picture:
+            return pulse_search
+        return replace(pulse_search, camera=find_path(surface, pulse_search.pulse))
 
 
 class Detrend:
@@ -60,7 +62,7 @@ class Detrend:
         """The frame without pulsation in flow and motion."""
         if frame.is_rest or frame.time_s is None:
             return frame
-        own, moved = self.pulse.at(frame.time_s), frame.motion
-        if moved is not None and frame.trusted:
-            moved = replace(moved, motion=moved.motion - own[..., [3, 4, 2]] * self._mm_per_px)
-        return replace(frame, flow=frame.flow - own[..., :2], motion=moved)
+        pulsation, motion = self.pulse.at(frame.time_s), frame.motion
+        if motion is not None and frame.trusted:
+            motion = replace(motion, motion=motion.motion - pulsation[..., [3, 4, 2]] * self._mm_per_px)
+        return replace(frame, flow=frame.flow - pulsation[..., :2], motion=motion)

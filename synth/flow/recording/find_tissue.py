@@ -23,45 +23,45 @@ class Limits:
 
     frames: int = 16  # tracked: in each part of the video the one that differs most from the rest frame
     step_px: int = 8  # px between those compared for it
-    moves: float = 2.0  # root mean square of the motion over its standard deviation; still pixels have 0.7
-    well: float = 0.2  # likewise over the median of what moves: flow carries some across a rim
-    rim: float = 0.2  # least share of the picture, still though it should move: openings 0.38, others 0.05
-    alike: float = 0.4  # largest overlap of the colours of what is still and what moves: openings 0.31
+    min_sigmas: float = 2.0  # root mean square of the motion over its standard deviation; still pixels 0.7
+    min_relative_motion: float = 0.2  # likewise over the median of what moves: flow carries some across a rim
+    min_still_share: float = 0.2  # of the picture, still though it should move: openings 0.38, others 0.05
+    max_overlap: float = 0.4  # largest overlap of the colours of what is still and what moves: openings 0.31
     bins: int = 16  # of each channel of the colours, for their overlap
-    fine: int = 180  # rows below which colours are smoothed less
-    near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
-    wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
-    sure: float = 0.7  # confidence above which a pixel is tracked
-    visible: float = 0.7  # share of frames in which a pixel has to be tracked
-    seen: float = 0.3  # likewise to tell that a part which has the tissue's colours moves as well
-    rounds: int = 5  # of GrabCut
-    part: float = 0.2  # share of what moves in the main part, from which another part is tissue too
-    small: float = 0.05  # share of the picture below which what is found is not the tissue
-    solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
-    still: float = (
-        0.04  # share of what is found that is still though it should move: right ones 0.01, others 0.06
-    )
-    less: float = 0.02  # by which the outline without it may be less solid
-    hollow: float = 0.75  # likewise, below which it is not the tissue
+    min_smooth_rows: int = 180  # rows below which colours are smoothed less
+    margin: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
+    half_width: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
+    min_confidence: float = 0.7  # confidence above which a pixel is tracked
+    min_visible: float = 0.7  # share of frames in which a pixel has to be tracked
+    min_seen: float = 0.3  # likewise to tell that a part which has the tissue's colours moves as well
+    iterations: int = 5  # of GrabCut
+    min_part: float = 0.2  # share of what moves in the main part, from which another part is tissue too
+    min_area: float = 0.05  # share of the picture below which what is found is not the tissue
+    clear_solidity: float = 0.93  # of its convex hull, below which it is doubtful: right ones 0.95 and more
+    max_contradiction: float = 0.04  # of it that is still though it should move: right ones 0.01, others 0.06
+    max_solidity_loss: float = 0.02  # by which the outline without it may be less solid
+    min_solidity: float = 0.75  # likewise, below which it is not the tissue
 
 
 def choose_frames(footage: Footage) -> frozenset[int]:
     """Numbers of the rest frame and of some later ones, as `Limits.frames` says."""
-    rest: Map | None = None
-    number, change = list[int](), list[float]()
+    rest_sample: Map | None = None
+    numbers, changes = list[int](), list[float]()
     for picture in footage.pictures():
-        wanted = footage.only is None or picture.index in footage.only
-        if picture.index < footage.rest_frame or not wanted or (number and picture.time_s is None):
+        is_wanted = footage.only is None or picture.index in footage.only
+        if picture.index < footage.rest_frame or not is_wanted or (numbers and picture.time_s is None):
             continue
-        some = picture.rgb[:: Limits.step_px, :: Limits.step_px].astype(np.float32)
-        rest = some if rest is None else rest
-        number.append(picture.index)
-        change.append(float(np.abs(some - rest).mean()) if some.shape == rest.shape else 0.0)
-    if not number:  # `Decoder` reports it
+        sample = picture.rgb[:: Limits.step_px, :: Limits.step_px].astype(np.float32)
+        rest_sample = sample if rest_sample is None else rest_sample
+        numbers.append(picture.index)
+        changes.append(
+            float(np.abs(sample - rest_sample).mean()) if sample.shape == rest_sample.shape else 0.0
+        )
+    if not numbers:  # `Decoder` reports it
         return frozenset()
-    parts = np.array_split(np.arange(1, len(number)), Limits.frames)
-    chosen = [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
-    return frozenset(number[k] for k in chosen)
+    parts = np.array_split(np.arange(1, len(numbers)), Limits.frames)
+    chosen = [0, *(max(part, key=changes.__getitem__) for part in parts if len(part))]
+    return frozenset(numbers[k] for k in chosen)
 
 
 class TissueSearch:
@@ -77,7 +77,7 @@ class TissueSearch:
         if frame.is_rest:
             self._hidden_at_rest = frame.hidden
         elif frame.trusted:
-            known = frame.confidence > Limits.sure
+            known = frame.confidence > Limits.min_confidence
             self._square += known * np.square(frame.flow).sum(axis=-1)
             self._variance += known * 2 * deviation(frame.confidence) ** 2
             self._count += known
@@ -86,53 +86,59 @@ class TissueSearch:
 
     def find(self) -> tuple[Mask, Finding]:
         """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
-        whole = self._rest.tissue
-        near, wide = (max(1, round(share * len(whole))) for share in (Limits.near, Limits.wide))
-        hidden = self._hidden_at_rest | (self._hidden > (1 - Limits.visible) * self._frames)
-        visible = whole & (self._count > Limits.visible * self._frames)
-        visible &= ~_morph(hidden, cv2.MORPH_DILATE, near)
-        motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
-        significant = motion > Limits.moves * noise
-        moves = visible & significant
-        if moves.any():
-            significant &= motion > Limits.well * np.median(motion[moves])
-        moves = _morph(_morph(visible & significant, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
-        core = _morph(moves, cv2.MORPH_ERODE, near)
+        picture = self._rest.tissue
+        margin, half_width = (
+            max(1, round(share * len(picture))) for share in (Limits.margin, Limits.half_width)
+        )
+        hidden = self._hidden_at_rest | (self._hidden > (1 - Limits.min_visible) * self._frames)
+        visible = picture & (self._count > Limits.min_visible * self._frames)
+        visible &= ~_morph(hidden, cv2.MORPH_DILATE, margin)
+        motion, noise = (
+            np.sqrt(total / np.maximum(self._count, 1)) for total in (self._square, self._variance)
+        )
+        significant = motion > Limits.min_sigmas * noise
+        moving = visible & significant
+        if moving.any():
+            significant &= motion > Limits.min_relative_motion * np.median(motion[moving])
+        moving = _morph(_morph(visible & significant, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, half_width)
+        core = _morph(moving, cv2.MORPH_ERODE, margin)
         if not core.any():
-            return whole, _state("nothing moves by which to find it: the whole picture is assumed")
-        expected = _expected(motion, moves) > Limits.moves * noise
+            return picture, _state("nothing moves by which to find it: the whole picture is assumed")
+        expected = _predict_motion(motion, moving) > Limits.min_sigmas * noise
         colours, still = _colours(self._rest.rgb), visible & (motion < noise)
-        is_bounded = np.mean(expected & still) > Limits.rim * np.mean(visible)
-        is_alike = np.minimum(*_histograms(colours, core, still)).sum() > Limits.alike
+        is_bounded = np.mean(expected & still) > Limits.min_still_share * np.mean(visible)
+        is_alike = np.minimum(*_histograms(colours, core, still)).sum() > Limits.max_overlap
         if not is_bounded or is_alike:
             if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
-                return whole, _state("it moves as tissue that fills the picture")
+                return picture, _state("it moves as tissue that fills the picture")
             if is_alike:
                 text = "neither motion nor colour shows a rim: the whole picture is assumed"
-                return whole, _state(text, "warning")
+                return picture, _state(text, "warning")
         # An instrument that is moved to and fro cuts tissue in parts, of which some are often hidden.
-        seen = whole & ~hidden & (self._count > Limits.seen * self._frames)
-        seeds = core | _morph(seen & significant, cv2.MORPH_OPEN, wide)
-        guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
-        held = _morph(expected & still & ~moves, cv2.MORPH_OPEN, 2)  # still, though tissue there would move
-        outside = still & ~_inner(whole)
-        tissue, solid = self._choose(colours, guess, core, seeds, hidden, outside)
-        if tissue[held].sum() > Limits.still * tissue.sum():  # it reaches too far
-            guess[held & ~core] = cv2.GC_BGD
-            other = self._choose(colours, guess, core, seeds, hidden, outside)
-            if other[1] > solid - Limits.less:
-                tissue, solid = other
+        seen = picture & ~hidden & (self._count > Limits.min_seen * self._frames)
+        seeds = core | _morph(seen & significant, cv2.MORPH_OPEN, half_width)
+        guess = np.where(core, cv2.GC_FGD, np.where(moving, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        # Still, though tissue there would move.
+        contradiction = _morph(expected & still & ~moving, cv2.MORPH_OPEN, 2)
+        outside = still & ~_remove_border(picture)
+        tissue, solidity = self._choose(colours, guess, core, seeds, hidden, outside)
+        if tissue[contradiction].sum() > Limits.max_contradiction * tissue.sum():  # it reaches too far
+            guess[contradiction & ~core] = cv2.GC_BGD
+            alternative = self._choose(colours, guess, core, seeds, hidden, outside)
+            if alternative[1] > solidity - Limits.max_solidity_loss:
+                tissue, solidity = alternative
         text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
-        if not is_bounded and solid < Limits.solid:
-            text, hull = "too little moves to find its rim: what moves is taken for it", whole & _hull(moves)
-            if hull.mean() < Limits.small:
+        if not is_bounded and solidity < Limits.clear_solidity:
+            text = "too little moves to find its rim: what moves is taken for it"
+            hull = picture & _hull(moving)
+            if hull.mean() < Limits.min_area:
                 return hull, _refuse(f"what moves is {100 * hull.mean():.2g}% of the picture")
             return hull, _state(text, "warning")
-        if tissue.mean() < Limits.small:
+        if tissue.mean() < Limits.min_area:
             return tissue, _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
-        if solid < Limits.hollow:
+        if solidity < Limits.min_solidity:
             return tissue, _refuse("what is found has an outline as tissue has none")
-        if solid < Limits.solid:
+        if solidity < Limits.clear_solidity:
             text += ", but with an uneven outline: see the picture of the masks"
             return tissue, _state(text, "warning")
         return tissue, _state(text)
@@ -142,24 +148,27 @@ class TissueSearch:
     ) -> tuple[Mask, float]:
         """Of two regions, from a guess and from one by colour, the rounder one: from either, tissue may be
         lost that instruments cut off."""
-        guesses = guess, _by_colour(guess, colours, core, outside)
+        guesses = guess, _relabel_by_colour(guess, colours, core, outside)
         return max(
-            (self._region(colours, one, core, seeds, hidden) for one in guesses), key=lambda part: part[1]
+            (self._grow_region(colours, candidate, core, seeds, hidden) for candidate in guesses),
+            key=lambda region: region[1],
         )
 
-    def _region(
+    def _grow_region(
         self, colours: Pixels, guess: Pixels, core: Mask, seeds: Mask, hidden: Mask
     ) -> tuple[Mask, float]:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
-        near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
-        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
-        tissue = _keep_moving(_with_hidden(tissue, seeds, hidden), core, seeds)
-        tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
+        margin, half_width = (
+            max(1, round(share * len(core))) for share in (Limits.margin, Limits.half_width)
+        )
+        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, margin) | core
+        tissue = _keep_moving(_add_hidden(tissue, seeds, hidden), core, seeds)
+        tissue = _fill_holes(_morph(_fill_holes(tissue), cv2.MORPH_CLOSE, half_width))
         hull = _hull(tissue)
         return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
 
 
-def touches_border(tissue: Mask) -> float:
+def measure_border_share(tissue: Mask) -> float:
     """Share of the outline of a mask (H, W) on the border of the picture, which is no edge of the tissue."""
     inner = cv2.erode(tissue.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     outline = tissue & ~inner
@@ -176,44 +185,44 @@ def _state(text: str, severity: Severity = "missing") -> Finding:
     return Finding(severity, "tissue", f"no mask of the tissue (tissue.png) is given: {text}")
 
 
-def _expected(motion: Map, moves: Mask) -> Map:
+def _predict_motion(motion: Map, moving: Mask) -> Map:
     """Motion (h, w) px of tissue without a rim: around what moves most it falls with distance, as 1 / r."""
-    half = float(np.percentile(motion[moves], 98)) / 2
-    most = moves & (motion > half)
-    radius = np.sqrt(np.count_nonzero(most) / np.pi)
-    distance = cv2.distanceTransform((~most).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(half * radius / (radius + distance), np.float32)
+    half_motion = float(np.percentile(motion[moving], 98)) / 2
+    strongest = moving & (motion > half_motion)
+    radius = np.sqrt(np.count_nonzero(strongest) / np.pi)
+    distance = cv2.distanceTransform((~strongest).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(half_motion * radius / (radius + distance), np.float32)
 
 
 def _colours(rgb: Pixels) -> Pixels:
     """Lab (h, w, 3), smoothed, with less of lightness, which shading changes, and more of colour."""
-    side = 5 if len(rgb) >= Limits.fine else 3  # px: in small pictures 5 would remove veins and the rim
+    side = 5 if len(rgb) >= Limits.min_smooth_rows else 3  # px: 5 in small pictures would remove veins, rim
     lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), side).astype(np.float32)
     return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
 
 
 def _histograms(colours: Pixels, *masks: Mask) -> list[Map]:
     """Histograms of the colours (h, w, 3) in masks, each of sum 1."""
-    bins, every = [Limits.bins] * 3, [0, 256] * 3
-    found = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in masks]
-    return [np.asarray(one / max(one.sum(), 1), np.float32) for one in found]
+    bins, ranges = [Limits.bins] * 3, [0, 256] * 3
+    histograms = [cv2.calcHist([colours], [0, 1, 2], mask.astype(np.uint8), bins, ranges) for mask in masks]
+    return [np.asarray(counts / max(counts.sum(), 1), np.float32) for counts in histograms]
 
 
-def _by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pixels:
+def _relabel_by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pixels:
     """A guess that adds what has the colours (h, w, 3) of the core rather than of what is outside."""
     core_share, outside_share = (
-        cv2.GaussianBlur(one.reshape(Limits.bins, -1), (0, 0), 0.5).reshape(one.shape) + 1e-5
-        for one in _histograms(colours, core, outside)
+        cv2.GaussianBlur(histogram.reshape(Limits.bins, -1), (0, 0), 0.5).reshape(histogram.shape) + 1e-5
+        for histogram in _histograms(colours, core, outside)
     )
-    at = tuple((colours // (256 // Limits.bins)).transpose(2, 0, 1))
-    odds = cv2.GaussianBlur(np.log(core_share[at] / outside_share[at]), (0, 0), 2)
-    added = np.where((guess == cv2.GC_PR_BGD) & (odds > 0), cv2.GC_PR_FGD, guess)
-    return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, added).astype(np.uint8)
+    indices = tuple((colours // (256 // Limits.bins)).transpose(2, 0, 1))
+    odds = cv2.GaussianBlur(np.log(core_share[indices] / outside_share[indices]), (0, 0), 2)
+    labels = np.where((guess == cv2.GC_PR_BGD) & (odds > 0), cv2.GC_PR_FGD, guess)
+    return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, labels).astype(np.uint8)
 
 
-def _inner(whole: Mask) -> Mask:
+def _remove_border(picture: Mask) -> Mask:
     """The picture without a band along its border."""
-    inside, band = np.zeros_like(whole), max(1, round(2 * Limits.wide * len(whole)))
+    inside, band = np.zeros_like(picture), max(1, round(2 * Limits.half_width * len(picture)))
     inside[band:-band, band:-band] = True
     return inside
 
@@ -223,16 +232,16 @@ def _grow(colours: Pixels, guess: Pixels) -> Mask:
     label = guess.copy()
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
-    cv2.grabCut(colours, label, None, background, foreground, Limits.rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(colours, label, None, background, foreground, Limits.iterations, cv2.GC_INIT_WITH_MASK)
     return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
 
 
-def _morph(mask: Mask, how: int, radius: int) -> Mask:
+def _morph(mask: Mask, operation: int, radius: int) -> Mask:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), how, disc) > 0)
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), operation, disc) > 0)
 
 
-def _with_hidden(mask: Mask, seeds: Mask, hidden: Mask) -> Mask:
+def _add_hidden(mask: Mask, seeds: Mask, hidden: Mask) -> Mask:
     """The mask with what instruments hide within the convex hull of its components that move (seeds)."""
     label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
     parts = mask & np.isin(label, np.unique(label[seeds]))
@@ -249,11 +258,13 @@ def _keep_moving(mask: Mask, core: Mask, seeds: Mask) -> Mask:
     """The component that contains most of the core, and others that move (seeds): veins divide tissue."""
     count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     largest = 1 + np.argmax(np.bincount(label[core], minlength=count)[1:])
-    moved = np.bincount(label[seeds & mask], minlength=count)
-    return np.asarray(np.isin(label, [largest, *np.flatnonzero(moved > Limits.part * moved[largest])]))
+    moving_px = np.bincount(label[seeds & mask], minlength=count)
+    return np.asarray(
+        np.isin(label, [largest, *np.flatnonzero(moving_px > Limits.min_part * moving_px[largest])])
+    )
 
 
-def _filled(mask: Mask) -> Mask:
+def _fill_holes(mask: Mask) -> Mask:
     """The mask without holes."""
     edges = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     return np.asarray(cv2.drawContours(np.zeros(mask.shape, np.uint8), edges, -1, 1, cv2.FILLED) > 0)

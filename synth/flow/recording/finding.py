@@ -35,24 +35,24 @@ def judge_young(young_kpa: float | None, phantom: bool = False) -> list[Finding]
 
 def judge_scale(mm_per_px: float, width_px: int) -> list[Finding]:
     """Findings on a scale: a picture of implausible width for a microscope's field of view."""
-    wide_mm = mm_per_px * width_px
-    if not wide_mm or _USUAL_MM[0] <= wide_mm <= _USUAL_MM[1]:
+    width_mm = mm_per_px * width_px
+    if not width_mm or _USUAL_MM[0] <= width_mm <= _USUAL_MM[1]:
         return []
-    possible = _POSSIBLE_MM[0] <= wide_mm <= _POSSIBLE_MM[1]
-    message = f"at {mm_per_px:.4g} mm/px the picture would be {wide_mm:.3g} mm wide: is the scale in mm/px?"
+    possible = _POSSIBLE_MM[0] <= width_mm <= _POSSIBLE_MM[1]
+    message = f"at {mm_per_px:.4g} mm/px the picture would be {width_mm:.3g} mm wide: is the scale in mm/px?"
     return [Finding("warning" if possible else "error", "scale", message)]
 
 
 def by_severity(findings: Iterable[Finding]) -> list[Finding]:
     """Errors, then warnings, then the others in their order."""
-    return sorted(findings, key=lambda one: {"error": 0, "warning": 1}.get(one.severity, 2))
+    return sorted(findings, key=lambda finding: {"error": 0, "warning": 1}.get(finding.severity, 2))
 
 
 def problems(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Errors, then warnings."""
-    return tuple(one for one in by_severity(findings) if one.severity in ("error", "warning"))
+    return tuple(finding for finding in by_severity(findings) if finding.severity in ("error", "warning"))
 
 
 def first_fault(findings: Iterable[Finding]) -> str:
     """Message of the first error; empty if there is none."""
-    return next((one.message for one in findings if one.severity == "error"), "")
+    return next((finding.message for finding in findings if finding.severity == "error"), "")

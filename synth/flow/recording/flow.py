@@ -40,8 +40,8 @@ class LocalFlow:
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self._tracker
         resets = tracker.resets
         flow, confidence = tracker.step(rgb, masked)
-        done: Future[FrameMotion] = Future()
-        done.set_result(
+        future: Future[FrameMotion] = Future()
+        future.set_result(
             FrameMotion(
                 flow,
                 confidence,
@@ -51,7 +51,7 @@ class LocalFlow:
                 wall_s=time.perf_counter() - wall,
             )
         )
-        return done
+        return future
 
 
 class FlowProcess(LocalFlow):
@@ -115,18 +115,18 @@ def _step(rgb: Pixels, masked: Mask) -> FrameMotion:
     return replace(frame, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 
 
-def with_flow(frame: FrameMotion, found: FrameMotion) -> FrameMotion:
-    """A frame with the flow `found` for it, whose uncertainty includes that of the camera's motion."""
-    confidence = found.confidence
+def with_flow(frame: FrameMotion, solution: FrameMotion) -> FrameMotion:
+    """A frame with the flow `solution` for it, whose uncertainty includes that of the camera's motion."""
+    confidence = solution.confidence
     if frame.camera is not None:
         confidence = add_deviation(confidence, frame.camera.deviation_px)
     return replace(
         frame,
-        flow=found.flow,
+        flow=solution.flow,
         confidence=confidence,
-        trusted=found.trusted and frame.trusted,
-        reinitialised=found.reinitialised,
-        cpu_s=found.cpu_s,
-        wall_s=found.wall_s,
-        peak_bytes=found.peak_bytes,
+        trusted=solution.trusted and frame.trusted,
+        reinitialised=solution.reinitialised,
+        cpu_s=solution.cpu_s,
+        wall_s=solution.wall_s,
+        peak_bytes=solution.peak_bytes,
     )

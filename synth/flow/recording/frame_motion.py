@@ -9,7 +9,7 @@ import numpy as np
 from synth.arrays import Map, Mask, Pixels
 from synth.flow.recording.camera_path import Similarity
 from synth.flow.recording.finding import Finding
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 
 Size = tuple[int, int]  # height, width [px]
 
@@ -43,7 +43,7 @@ class FrameMotion:
     masked: Mask | None = None  # (h, w) where the picture shows no tissue; None: nowhere
     tool: Mask | None = None  # (h, w) instruments and other objects; None: none
     camera: Similarity | None = None  # camera motion, which is removed from the flow; None: none
-    motion: Moved | None = None  # in three dimensions; None: monocular
+    motion: Motion3D | None = None  # in three dimensions; None: monocular
     index: int = 0  # number in the video
     time_s: float | None = None  # on the clock of the video; only that of the rest frame may be unknown
     # (h, w, 3) the downsampled picture without camera motion.
@@ -97,5 +97,5 @@ class TrackingSummary:
         """A sentence for reports."""
         masked = f"{100 * self.shares['masked']:.3g}% of the tissue is masked on average; "
         lost = f"{self.lost} of {self.frames} frames could not be tracked"
-        again = f", {self.reinitialised} only at a second attempt" if self.reinitialised else ""
-        return masked + lost + again
+        retries = f", {self.reinitialised} only at a second attempt" if self.reinitialised else ""
+        return masked + lost + retries

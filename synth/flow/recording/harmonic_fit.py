@@ -16,21 +16,21 @@ Span = tuple[float, float]
 class Fit:
     """Constants of rhythms, chosen by hand on the videos of tests/synth/flow/recording/test_pulse.py."""
 
-    harmonics: int = 3  # most harmonics of a phase
+    max_harmonics: int = 3  # most harmonics of a phase
     knot_s: float = 4.0  # between corrections of the phase
     bend: float = 0.3  # prior on second differences of the phase, over the mean weight of the data
-    small: float = 0.01  # prior on the correction of the phase, likewise
-    rounds: int = 6  # Gauss-Newton iterations
+    phase_prior: float = 0.01  # prior on the correction of the phase, likewise
+    iterations: int = 6  # Gauss-Newton iterations
     folds: int = 6  # of cross-validation over time
-    predicted: float = 0.3  # least share of the variance of held-out frames that a rhythm predicts
+    min_predicted: float = 0.3  # least share of the variance of held-out frames that a rhythm predicts
     rates_hz: Span = (0.08, 3.5)  # slowest breath, fastest heart rate
-    periods: float = 3.0  # least number of periods in the frames: fewer look like drift
-    most: int = 3  # most accepted rhythms (heart, breath, residual), and most rejected ones
-    even: float = 3.0  # largest 95th percentile of amplitude over median: without, 4 of 23 videos pulsate
-    least_px: float = 0.03  # least median amplitude: the error of the flow is of this size
-    main: int = 6  # principal components of the motion in which rates are searched
-    faster: float = 0.95  # share of the explained variance that two or three times the best rate must reach
-    alike: float = 0.03  # relative distance below which a rate equals a harmonic of another
+    min_periods: float = 3.0  # least number of periods in the frames: fewer look like drift
+    max_rhythms: int = 3  # most accepted rhythms (heart, breath, residual), and most rejected ones
+    max_unevenness: float = 3.0  # 95th percentile of amplitude over median: without, 4 of 23 videos pulsate
+    min_amplitude_px: float = 0.03  # least median amplitude: the error of the flow is of this size
+    components: int = 6  # principal components of the motion in which rates are searched
+    min_faster_share: float = 0.95  # of the explained variance that two or three times the best rate reaches
+    rate_tolerance: float = 0.03  # relative distance below which a rate equals a harmonic of another
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ class Rhythm:
 
     def amplitude(self, basis: Floats) -> Floats:
         """Amplitude (P,), half of the peak-to-peak motion, at places of the basis (P, B)."""
-        turn = _waves(np.linspace(0, 2 * np.pi, 48, endpoint=False), self.harmonics)
-        path = np.einsum("pa,tac->tpc", basis, np.tensordot(turn, self.modes, axes=1))
+        cycle = _waves(np.linspace(0, 2 * np.pi, 48, endpoint=False), self.harmonics)
+        path = np.einsum("pa,tac->tpc", basis, np.tensordot(cycle, self.modes, axes=1))
         return np.asarray(np.linalg.norm(np.ptp(path, axis=0), axis=1) / 2, np.float64)
 
 
@@ -75,88 +75,91 @@ def find_rhythms(
     # In these coordinates the norm is the root mean square of the motion over the places.
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
     y = np.einsum("ab,tbc->tac", metric, coefficients).reshape(len(t), -1)
-    back = np.linalg.inv(metric)
-    found, best, accepted = list[Rhythm](), list[Rhythm](), list[bool]()
-    while accepted.count(True) < Fit.most and accepted.count(False) < Fit.most:
-        rate = _strongest_rate(t, y, found)
+    inverse = np.linalg.inv(metric)
+    candidates, selected, accepted = list[Rhythm](), list[Rhythm](), list[bool]()
+    while accepted.count(True) < Fit.max_rhythms and accepted.count(False) < Fit.max_rhythms:
+        rate = _find_strongest_rate(t, y, candidates)
         if rate is None:
             break
-        found, periodic = _add_rhythm(t, y, found, rate)
-        if _is_harmonic(found):
+        candidates, periodic = _add_rhythm(t, y, candidates, rate)
+        if _is_harmonic(candidates):
             break
-        size = fit(t, y, found, back)[-1].amplitude(basis)
-        if np.median(size) < Fit.least_px:
+        amplitude = fit(t, y, candidates, inverse)[-1].amplitude(basis)
+        if np.median(amplitude) < Fit.min_amplitude_px:
             break
-        accepted.append(periodic and bool(np.percentile(size, 95) <= Fit.even * np.median(size)))
+        accepted.append(
+            periodic and bool(np.percentile(amplitude, 95) <= Fit.max_unevenness * np.median(amplitude))
+        )
         # Rejected rhythms after the last accepted one are noise and are not fitted.
-        best = found if accepted[-1] else best
-    fitted = list(zip(fit(t, y, best, back), accepted, strict=False))
-    return tuple(one for one, own in fitted if own), tuple(one for one, own in fitted if not own)
+        selected = candidates if accepted[-1] else selected
+    fitted = list(zip(fit(t, y, selected, inverse), accepted, strict=False))
+    rhythms = tuple(rhythm for rhythm, is_accepted in fitted if is_accepted)
+    return rhythms, tuple(rhythm for rhythm, is_accepted in fitted if not is_accepted)
 
 
-def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[Rhythm]:
+def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], inverse: Floats) -> list[Rhythm]:
     """Rhythms of known phase with their modes, fitted with a constant and a drift to coefficients `y`
-    (T, B C) at times (T,) s by least squares; `back` (B, B) transforms from the coordinates of `y`."""
+    (T, B C) at times (T,) s by least squares; `inverse` (B, B) transforms from the coordinates of `y`."""
     weights = np.linalg.lstsq(_design(t, rhythms), y, rcond=None)[0]
-    modes = np.einsum("ab,kbc->kac", back, weights.reshape(len(weights), len(back), -1))
-    ends = np.cumsum([2, *(2 * one.harmonics for one in rhythms)])
-    return [replace(one, modes=modes[a:b]) for one, a, b in zip(rhythms, ends, ends[1:], strict=False)]
+    modes = np.einsum("ab,kbc->kac", inverse, weights.reshape(len(weights), len(inverse), -1))
+    ends = np.cumsum([2, *(2 * rhythm.harmonics for rhythm in rhythms)])
+    return [replace(rhythm, modes=modes[a:b]) for rhythm, a, b in zip(rhythms, ends, ends[1:], strict=False)]
 
 
 def visible_rates(t: Floats) -> Span | None:
     """Lowest and highest rate [Hz] that frames at times (T,) s can resolve; None: there is none."""
-    low = max(Fit.rates_hz[0], Fit.periods / max(float(np.ptp(t)), 1e-9))
+    low = max(Fit.rates_hz[0], Fit.min_periods / max(float(np.ptp(t)), 1e-9))
     high = min(Fit.rates_hz[1], 0.45 / float(np.median(np.diff(t))))
     return (low, high) if low < high else None
 
 
 def _waves(phase: Floats, harmonics: int) -> Floats:
     """Cosine and sine (T, 2 H) of each harmonic of a phase (T,) [rad]."""
-    turns = phase[:, None] * np.arange(1, harmonics + 1)
-    return np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(phase), -1)
+    phases = phase[:, None] * np.arange(1, harmonics + 1)
+    return np.stack([np.cos(phases), np.sin(phases)], axis=2).reshape(len(phase), -1)
 
 
 def _design(t: Floats, rhythms: Sequence[Rhythm]) -> Floats:
     """Design matrix (T, K): a constant (noise of the rest frame), a drift, and the waves of each rhythm."""
     middle = (t - t.mean()) / max(float(np.ptp(t)), 1e-9)
-    parts = [np.ones((len(t), 1)), middle[:, None], *(one.waves(t) for one in rhythms)]
-    return np.concatenate(parts, axis=1)
+    blocks = [np.ones((len(t), 1)), middle[:, None], *(rhythm.waves(t) for rhythm in rhythms)]
+    return np.concatenate(blocks, axis=1)
 
 
 def _harmonics(t: Floats, rate_hz: float) -> int:
     """Number of harmonics that the frames can resolve."""
-    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, Fit.harmonics))
+    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, Fit.max_harmonics))
 
 
-def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | None:
+def _find_strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | None:
     """Rate whose waves explain most of the residual (Lomb 1976; Scargle 1982); None: there is none."""
     rates_hz = visible_rates(t)
     if rates_hz is None:
         return None
-    known = _design(t, rhythms)
-    left = y - known @ np.linalg.lstsq(known, y, rcond=None)[0]
-    if not left.any():  # tissue that never moves has no rate
+    design = _design(t, rhythms)
+    residual = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    if not residual.any():  # tissue that never moves has no rate
         return None
-    u, s, _ = np.linalg.svd(left, full_matrices=False)
-    main = u[:, : Fit.main] * s[: Fit.main]
+    u, s, _ = np.linalg.svd(residual, full_matrices=False)
+    components = u[:, : Fit.components] * s[: Fit.components]
 
     def loss(rate: float) -> float:
-        columns = np.concatenate([known, _waves(2 * np.pi * rate * t, _harmonics(t, rate))], axis=1)
-        gram, right = columns.T @ columns, columns.T @ main
+        columns = np.concatenate([design, _waves(2 * np.pi * rate * t, _harmonics(t, rate))], axis=1)
+        gram, rhs = columns.T @ columns, columns.T @ components
         gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
-        return -float((right * np.linalg.solve(gram, right)).sum())
+        return -float((rhs * np.linalg.solve(gram, rhs)).sum())
 
     step = 1 / (6 * float(np.ptp(t)))
-    best: float = min(np.arange(*rates_hz, step).tolist(), key=loss)
+    best_rate: float = min(np.arange(*rates_hz, step).tolist(), key=loss)
     # The waves of half or a third of a rate include its own: the fastest rate of similar fit is right.
     for order in (3, 2):
-        if order * best < rates_hz[1]:
-            around = np.linspace(order * best - 2 * step, order * best + 2 * step, 17)
-            faster: float = min(around.tolist(), key=loss)
-            if loss(faster) < Fit.faster * loss(best):
-                best = faster
+        if order * best_rate < rates_hz[1]:
+            candidates = np.linspace(order * best_rate - 2 * step, order * best_rate + 2 * step, 17)
+            faster_rate: float = min(candidates.tolist(), key=loss)
+            if loss(faster_rate) < Fit.min_faster_share * loss(best_rate):
+                best_rate = faster_rate
                 break
-    return float(minimize_scalar(loss, bounds=(best - step, best + step), method="bounded").x)
+    return float(minimize_scalar(loss, bounds=(best_rate - step, best_rate + step), method="bounded").x)
 
 
 def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) -> tuple[list[Rhythm], bool]:
@@ -169,32 +172,33 @@ def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) ->
         refined = _refine(t, y, [*rhythms, Rhythm(rate, knots, np.zeros(count), harmonics)])
         if _predicts(t, y, refined):
             # The correction of the phase may have made it too slow to repeat in the frames.
-            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= Fit.periods - 0.5
+            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= Fit.min_periods - 0.5
     return refined, False
 
 
 def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
     """Refines the corrections of the phases by Gauss-Newton with a smoothness prior."""
-    now = list(rhythms)
-    for _ in range(Fit.rounds):
-        design = _design(t, now)
+    refined = list(rhythms)
+    for _ in range(Fit.iterations):
+        design = _design(t, refined)
         weights = np.linalg.lstsq(design, y, rcond=None)[0]
-        left, at = y - design @ weights, 2
-        for k, one in enumerate(now):
-            waves = one.waves(t).reshape(len(t), one.harmonics, 2)
-            order = np.arange(1, one.harmonics + 1)[:, None]
+        residual, column = y - design @ weights, 2
+        for k, rhythm in enumerate(refined):
+            waves = rhythm.waves(t).reshape(len(t), rhythm.harmonics, 2)
+            order = np.arange(1, rhythm.harmonics + 1)[:, None]
             slope = (np.stack([-waves[..., 1], waves[..., 0]], axis=2) * order).reshape(len(t), -1)
-            change = slope @ weights[at : at + 2 * one.harmonics]
-            at += 2 * one.harmonics
-            count = len(one.lead)
-            hats = np.stack([np.interp(t, one.knots_s, row) for row in np.eye(count)], axis=1)
+            change = slope @ weights[column : column + 2 * rhythm.harmonics]
+            column += 2 * rhythm.harmonics
+            count = len(rhythm.lead)
+            hats = np.stack([np.interp(t, rhythm.knots_s, row) for row in np.eye(count)], axis=1)
             normal = (hats * np.square(change).sum(axis=1)[:, None]).T @ hats
             bend = np.diff(np.eye(count), 2, axis=0) if count > 2 else np.zeros((1, count))
             weight = float(np.trace(normal)) / count
-            normal += weight * (Fit.bend * bend.T @ bend + Fit.small * np.eye(count))
-            pull = hats.T @ (change * left).sum(axis=1) - weight * Fit.bend * bend.T @ (bend @ one.lead)
-            now[k] = replace(one, lead=one.lead + np.linalg.solve(normal, pull))
-    return now
+            normal += weight * (Fit.bend * bend.T @ bend + Fit.phase_prior * np.eye(count))
+            pull = hats.T @ (change * residual).sum(axis=1)
+            pull = pull - weight * Fit.bend * bend.T @ (bend @ rhythm.lead)
+            refined[k] = replace(rhythm, lead=rhythm.lead + np.linalg.solve(normal, pull))
+    return refined
 
 
 def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
@@ -204,15 +208,17 @@ def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
     def error(design: Floats) -> float:
         total = 0.0
         for k in range(Fit.folds):
-            out = fold == k
-            predicted = design[out] @ np.linalg.lstsq(design[~out], y[~out], rcond=None)[0]
-            total += float(np.square(y[out] - predicted).sum())
+            held_out = fold == k
+            prediction = design[held_out] @ np.linalg.lstsq(design[~held_out], y[~held_out], rcond=None)[0]
+            total += float(np.square(y[held_out] - prediction).sum())
         return total
 
-    return error(_design(t, rhythms)) < (1 - Fit.predicted) * error(_design(t, rhythms[:-1]))
+    return error(_design(t, rhythms)) < (1 - Fit.min_predicted) * error(_design(t, rhythms[:-1]))
 
 
 def _is_harmonic(rhythms: Sequence[Rhythm]) -> bool:
     """Whether the last rate equals another rate, its half, or a harmonic of it."""
-    *others, last = (one.rate_hz for one in rhythms)
-    return any(abs(last - order * rate) < Fit.alike * last for rate in others for order in (0.5, 1, 2, 3))
+    *others, last = (rhythm.rate_hz for rhythm in rhythms)
+    return any(
+        abs(last - order * rate) < Fit.rate_tolerance * last for rate in others for order in (0.5, 1, 2, 3)
+    )

@@ -16,7 +16,7 @@ from synth.flow.rest_evidence import RestEvidence
 from synth.flow.segmentation import Segmentation, segment
 from synth.video.read_video import shrink_mask
 
-_MOST = 0.4  # share of the tissue: more of it is taken for tissue that looks like instruments
+_MAX_HIDDEN = 0.4  # share of the tissue: more of it is taken for tissue that looks like instruments
 
 
 class MaskFrame:
@@ -36,43 +36,44 @@ class MaskFrame:
         self._evidence: RestEvidence | None = None  # from the rest frame on
         self._lookalikes: Lookalikes | None = None
         if lookalikes is not None and lookalikes.any():
-            self._lookalikes = Lookalikes(rest.rgb, _resized(lookalikes, rest.tissue.shape))
+            self._lookalikes = Lookalikes(rest.rgb, _resize_mask(lookalikes, rest.tissue.shape))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """The frame with its masks; it is not trusted if its picture shows nothing that could be tracked."""
         trusted = frame.trusted and not find_fault(frame.rgb, self._rest.tissue)
         masked = tool = np.zeros(frame.rgb.shape[:2], bool)
         if self._kind != "none":
-            found = segment(self._rest.rgb, frame.rgb)
+            segmentation = segment(self._rest.rgb, frame.rgb)
             if self._tool is None:
                 if self._lookalikes is not None:
-                    found = self._lookalikes.remove(found, frame.rgb)
-                looks = self._weigh(found, frame)
+                    segmentation = self._lookalikes.remove(segmentation, frame.rgb)
+                classes = self._weigh(segmentation, frame)
                 if frame.is_rest:
-                    self._evidence = RestEvidence(self._rest.rgb, found)
+                    self._evidence = RestEvidence(self._rest.rgb, segmentation)
                 elif self._evidence is not None:
-                    found = self._evidence.weigh(found, frame.rgb)
+                    segmentation = self._evidence.weigh(segmentation, frame.rgb)
                 # Shadows change the picture too: with their odds raised, instruments are taken for hands.
-                masked, tool = _plausible(self._weigh(found, frame), self._rest.tissue), looks.objects
+                masked = _select_hidden(self._weigh(segmentation, frame), self._rest.tissue)
+                tool = classes.objects
             else:
-                given = self._tool(frame.index, self._rest.size)
-                tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
+                tool_mask = self._tool(frame.index, self._rest.size)
+                tool = tool if tool_mask is None else shrink_mask(tool_mask, self._rest.shrink, 0)
                 if frame.camera is not None:
                     tool = frame.camera.undo(tool.astype(np.uint8) * 255) > 127
-                masked = tool | found.shines
+                masked = tool | segmentation.glare
         if frame.camera is not None:
             masked = masked | frame.camera.outside(masked.shape)
         return replace(frame, masked=masked, tool=tool, trusted=trusted)
 
-    def _weigh(self, found: Segmentation, frame: FrameMotion) -> Segmentation:
+    def _weigh(self, segmentation: Segmentation, frame: FrameMotion) -> Segmentation:
         """The classes of a frame, instruments more likely where they are expected."""
-        there = None if self._expected is None else self._expected(frame.index, self._rest.size)
-        if there is None:
-            return found
-        there = shrink_mask(there, self._rest.shrink, 0)
+        expected = None if self._expected is None else self._expected(frame.index, self._rest.size)
+        if expected is None:
+            return segmentation
+        expected = shrink_mask(expected, self._rest.shrink, 0)
         if frame.camera is not None:
-            there = frame.camera.undo(there.astype(np.uint8) * 255) > 127
-        return found.expect(there)
+            expected = frame.camera.undo(expected.astype(np.uint8) * 255) > 127
+        return segmentation.expect(expected)
 
 
 class MaskRight:
@@ -87,22 +88,22 @@ class MaskRight:
 
     def mask_rest(self) -> Mask:
         """Mask (h, w) of its rest picture."""
-        everywhere = np.ones(self._rest.shape[:2], bool)
-        return ~everywhere if self._kind == "none" else _plausible(self._at_rest, everywhere)
+        full_mask = np.ones(self._rest.shape[:2], bool)
+        return ~full_mask if self._kind == "none" else _select_hidden(self._at_rest, full_mask)
 
     def mask(self, rgb: Pixels, tissue: Mask) -> Mask:
         """Mask (h, w) of a later picture (h, w, 3); `tissue`: (h, w), in its rest picture."""
         if self._kind == "none":
             return np.zeros(tissue.shape, bool)
-        return _plausible(self._evidence.weigh(segment(self._rest, rgb), rgb), tissue)
+        return _select_hidden(self._evidence.weigh(segment(self._rest, rgb), rgb), tissue)
 
 
-def _resized(mask: Mask, size: tuple[int, ...]) -> Mask:
-    wide = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(wide > 0)
+def _resize_mask(mask: Mask, size: tuple[int, ...]) -> Mask:
+    resized = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(resized > 0)
 
 
-def _plausible(found: Segmentation, tissue: Mask) -> Mask:
+def _select_hidden(segmentation: Segmentation, tissue: Mask) -> Mask:
     """What is hidden; the highlights alone if so much of the tissue is that it is taken for instruments."""
-    hidden = found.hidden
-    return hidden if (hidden & tissue).sum() <= _MOST * tissue.sum() else found.shines
+    hidden = segmentation.hidden
+    return hidden if (hidden & tissue).sum() <= _MAX_HIDDEN * tissue.sum() else segmentation.glare

@@ -48,24 +48,24 @@ def judge_quality(stereo: PairQuality) -> list[Finding]:
         rows = f"rows of left and right picture are {stereo.epipolar_px:.2g} px off"
         return [Finding("error", "stereo", f"{rows}: is the calibration of this camera pair?")]
     poor = stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM
-    found = [Finding("warning" if poor else "ok", "stereo", stereo.describe())]
-    found += [Finding("warning", "camera", f"right camera: {text}") for text in stereo.motion]
+    findings = [Finding("warning" if poor else "ok", "stereo", stereo.describe())]
+    findings += [Finding("warning", "camera", f"right camera: {text}") for text in stereo.motion]
     if stereo.last_rows_px > max(_OFF_ROWS_PX, 2 * stereo.epipolar_px):
-        moved = f"rows of left and right picture are {stereo.last_rows_px:.2g} px off at the end, but"
-        moved += f" {stereo.epipolar_px:.2g} px in the rest frame: was the right camera bumped?"
-        found.append(Finding("error", "stereo", moved))
+        message = f"rows of left and right picture are {stereo.last_rows_px:.2g} px off at the end, but"
+        message += f" {stereo.epipolar_px:.2g} px in the rest frame: was the right camera bumped?"
+        findings.append(Finding("error", "stereo", message))
     if stereo.sharpness < _SOFT:
-        share = f"has {100 * stereo.sharpness:.0f}% of the left camera's fine detail: is it out of focus?"
-        found.append(Finding("warning", "stereo", f"the right camera {share}"))
-    return found
+        softness = f"has {100 * stereo.sharpness:.0f}% of the left camera's fine detail: is it out of focus?"
+        findings.append(Finding("warning", "stereo", f"the right camera {softness}"))
+    return findings
 
 
 def judge_pair_scale(stereo: PairQuality, stated: float | None) -> list[Finding]:
     """Findings on a stated scale [mm/px] that differs from that of the right or depth camera."""
-    if not stated or (off := abs(np.log(stereo.mm_per_px / stated))) <= _OTHER_SCALE:
+    if not stated or (log_ratio := abs(np.log(stereo.mm_per_px / stated))) <= _OTHER_SCALE:
         return []
     message = f"{stated:.4g} mm/px is stated, but stereo gives {stereo.mm_per_px:.4g}"
-    for unit, times in _UNITS_MM.items():
-        if abs(np.log(times * stereo.mm_per_px / stated)) < _ANOTHER_SCALE:
-            message += f": if its calibration is in {unit}, multiply mm_per_unit by {times:g}"
-    return [Finding("error" if off > _ANOTHER_SCALE else "warning", "scale", message)]
+    for unit, factor in _UNITS_MM.items():
+        if abs(np.log(factor * stereo.mm_per_px / stated)) < _ANOTHER_SCALE:
+            message += f": if its calibration is in {unit}, multiply mm_per_unit by {factor:g}"
+    return [Finding("error" if log_ratio > _ANOTHER_SCALE else "warning", "scale", message)]

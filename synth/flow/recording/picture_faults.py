@@ -45,8 +45,8 @@ class Limits:
     alike: float = 1.5  # largest ratio of the changes at three key frames
 
 
-_SOME = 5  # most times that a message lists
-_AROUND = 25  # pictures before and after one in which the usual noise is measured
+_MAX_LISTED = 5  # most times that a message lists
+_HALF_WINDOW = 25  # pictures before and after one in which the usual noise is measured
 _STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise distinguishes two pictures
 
 
@@ -70,10 +70,10 @@ def find_fault(rgb: Pixels, tissue: Mask) -> str:
 def find_bars(rgb: Pixels) -> Mask:
     """Mask (H, W) of black bars along the borders of a picture (H, W, 3)."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    bars, least = np.zeros(grey.shape, bool), Limits.bar * float(np.percentile(grey, 95))
-    for lines, across in ((grey, bars), (grey.T, bars.T)):
-        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < Limits.even)
-        across |= (np.minimum.accumulate(dark) | np.minimum.accumulate(dark[::-1])[::-1])[:, None]
+    bars, max_level = np.zeros(grey.shape, bool), Limits.bar * float(np.percentile(grey, 95))
+    for lines, bar_lines in ((grey, bars), (grey.T, bars.T)):
+        dark = (np.percentile(lines, 98, axis=1) < max_level) & (lines.std(axis=1) < Limits.even)
+        bar_lines |= (np.minimum.accumulate(dark) | np.minimum.accumulate(dark[::-1])[::-1])[:, None]
     return bars & ~bars.all()
 
 
@@ -91,7 +91,7 @@ class VideoFaults:
     def __init__(self, rgb: Pixels, small: Pixels, tissue: Mask) -> None:
         """Starts with the rest frame (H, W, 3), also downsampled (h, w, 3), and its tissue mask (h, w)."""
         self._tissue, self._rest_rgb, self._last = tissue, small, rgb[::_STRIDE, ::_STRIDE]
-        self._last_coarse = _coarse(rgb)
+        self._last_coarse = _average_squares(rgb)
         self._first = [rgb]  # pictures, from the rest frame on
         self.changes = False  # whether a tracked picture differs from the rest frame
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -110,17 +110,17 @@ class VideoFaults:
         level = float(np.percentile(grey[tissue], 95))
         corners = cv2.filter2D(grey, -1, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32))
         noise = float(np.median(np.abs(corners[tissue]))) / 6 / 0.6745  # Immerkaer 1996, by the median
-        soft = self._fine / max(float(_detail(grey, 1, 4)[tissue].std()), 1e-6)
+        sharpness = self._fine / max(float(_detail(grey, 1, 4)[tissue].std()), 1e-6)
         steps = [_grid(lines) for lines in (rgb[..., 1].astype(np.float32), rgb[..., 1].T.astype(np.float32))]
         dim = f"the video is dim: 95% of the tissue is below grey level {level:.0f} of 255"
         no_detail = "the rest frame has no fine detail: is it out of focus or strongly compressed?"
         rest = (
             (level < Limits.dim, dim),
             (noise > Limits.noisy, f"the video is noisy: {noise:.0f} grey levels"),
-            (soft < Limits.soft, no_detail),
+            (sharpness < Limits.soft, no_detail),
             (min(steps) > Limits.grid, "the pictures have blocks of 8 px: they are strongly compressed"),
         )
-        self._rest = [message for wrong, message in rest if wrong]
+        self._rest = [message for is_faulty, message in rest if is_faulty]
 
     def add_decoded(self, index: int, time_s: float, rgb: Pixels, damaged: bool = False) -> None:
         """Adds a picture (H, W, 3) of the video; every picture in order. `damaged`: not decoded as it was
@@ -129,17 +129,17 @@ class VideoFaults:
         if damaged:
             self._damaged.append(time_s)
         self._first += [rgb] * (len(self._first) < stereo_layout.PICTURES)
-        one, coarse = rgb[::_STRIDE, ::_STRIDE], _coarse(rgb)
-        if one.shape == self._last.shape:
-            change = cv2.absdiff(one, self._last).mean(axis=2)
+        sample, coarse = rgb[::_STRIDE, ::_STRIDE], _average_squares(rgb)
+        if sample.shape == self._last.shape:
+            change = cv2.absdiff(sample, self._last).mean(axis=2)
             parts = cv2.resize(change, (8, 6), interpolation=cv2.INTER_AREA)
             self._numbers.append(index)
             self._times.append(time_s)
             self._changes.append((float(change.mean()), float(parts.min()), float(np.median(parts))))
-            moved = np.abs(coarse - self._last_coarse).mean(axis=2)
-            median = float(np.median(cv2.resize(moved, (8, 6), interpolation=cv2.INTER_AREA)))
-            self._coarse.append((float(moved.mean()), median))
-        self._last, self._last_coarse = one, coarse  # of another size in a stream that changes its mode
+            coarse_change = np.abs(coarse - self._last_coarse).mean(axis=2)
+            median = float(np.median(cv2.resize(coarse_change, (8, 6), interpolation=cv2.INTER_AREA)))
+            self._coarse.append((float(coarse_change.mean()), median))
+        self._last, self._last_coarse = sample, coarse  # of another size in a stream that changes its mode
 
     def add_tracked(self, time_s: float, rgb: Pixels, small: Pixels) -> None:
         """Adds a picture that is tracked, and the same downsampled."""
@@ -148,46 +148,52 @@ class VideoFaults:
         if fine < Limits.blurred * self._fine:
             self._blurred.append(time_s)
         green = rgb[:, ::2, 1].astype(np.float32)
-        near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
+        adjacent, alternate = (
+            cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2)
+        )
         # The blocks of largest ratio: elsewhere the picture may be at rest.
-        torn = (near / (far + 1))[8::16, 4::8]
-        if torn.size and np.percentile(torn, 98) > Limits.combed:
+        ratio = (adjacent / (alternate + 1))[8::16, 4::8]
+        if ratio.size and np.percentile(ratio, 98) > Limits.combed:
             self._combed.append(time_s)
 
     def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
         """Repeated pictures as {number: number of the picture shown}, certain ones, and those for which the
         tissue may just have been still. The rest frame has number -1."""
-        change, quiet, median = np.array(self._changes).reshape(-1, 3).T
-        surely, maybe = dict[int, int](), dict[int, int]()
+        change, minimum, median = np.array(self._changes).reshape(-1, 3).T
+        certain, possible = dict[int, int](), dict[int, int]()
         if not change.any():
-            return surely, maybe
-        usual = float(np.median(change[change > 0]))
+            return certain, possible
+        usual_change = float(np.median(change[change > 0]))
         # Noise on copies of a picture hides that they are equal, but each new exposure has noise of its own.
         # It must be usual before and after: a change of light or gain changes it for good.
-        levels = np.column_stack([quiet, median])
-        padded = np.pad(levels, ((_AROUND, _AROUND - 1), (0, 0)), constant_values=np.nan)
-        before = np.nanmedian(sliding_window_view(padded, _AROUND + 1, axis=0)[: len(levels)], axis=-1)
-        after = np.nanmedian(sliding_window_view(padded, _AROUND, axis=0)[_AROUND:], axis=-1)
+        levels = np.column_stack([minimum, median])
+        padded = np.pad(levels, ((_HALF_WINDOW, _HALF_WINDOW - 1), (0, 0)), constant_values=np.nan)
+        before = np.nanmedian(sliding_window_view(padded, _HALF_WINDOW + 1, axis=0)[: len(levels)], axis=-1)
+        after = np.nanmedian(sliding_window_view(padded, _HALF_WINDOW, axis=0)[_HALF_WINDOW:], axis=-1)
         floor = np.minimum(before, after)
         stale = ((floor > Limits.noise) & (levels < Limits.stale * floor)).all(axis=1)
-        same = np.concatenate([[False], stale | (change < Limits.same * usual), [False]]).astype(int)
+        same = np.concatenate([[False], stale | (change < Limits.same * usual_change), [False]]).astype(int)
         # A coder that repeats still parts of a picture leaves some without any change in most videos.
-        others = quiet[same[1:-1] == 0]
-        noisy = len(others) > 0 and float(np.quantile(others, Limits.stillest)) > Limits.still
+        new_minimum = minimum[same[1:-1] == 0]
+        noisy = len(new_minimum) > 0 and float(np.quantile(new_minimum, Limits.stillest)) > Limits.still
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
             caught_up = (
-                stop < len(change) and change[stop] > Limits.caught_up * usual and not self._is_recoded(stop)
+                stop < len(change)
+                and change[stop] > Limits.caught_up * usual_change
+                and not self._is_recoded(stop)
             )
             shown = self._numbers[first - 1] if first else -1
-            (surely if noisy or caught_up else maybe).update(dict.fromkeys(self._numbers[first:stop], shown))
-        return surely, maybe
+            (certain if noisy or caught_up else possible).update(
+                dict.fromkeys(self._numbers[first:stop], shown)
+            )
+        return certain, possible
 
     def _is_recoded(self, k: int) -> bool:
         """Whether the k-th change is evenly small over the picture: its detail was coded anew."""
         mean, median = self._coarse[k]
         return Limits.local * mean < median < Limits.recoded
 
-    def _leaps(self) -> list[int]:
+    def _find_leaps(self) -> list[int]:
         """Numbers of the changes of the whole picture that exceed those before and after.
 
         The median over parts ignores an instrument that enters; a cut or bump changes most of the picture.
@@ -215,29 +221,32 @@ class VideoFaults:
 
     def findings(self) -> list[Finding]:
         """Findings after the last frame."""
-        again = self.repeats()[0]
-        cuts = [self._times[k] for k in self._leaps() if not again.keys() & set(self._numbers[k - 1 : k + 2])]
-        at = dict(zip(self._numbers, self._times, strict=True))
-        found = [Finding("warning", "pictures", message) for message in self._rest]
+        repeats = self.repeats()[0]
+        leaps = [k for k in self._find_leaps() if not repeats.keys() & set(self._numbers[k - 1 : k + 2])]
+        cuts = [self._times[k] for k in leaps]
+        time_s = dict(zip(self._numbers, self._times, strict=True))
+        findings = [Finding("warning", "pictures", message) for message in self._rest]
         if self._layout:
-            cure = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
-            message = stereo_layout.MIXED.get(self._layout, cure)
-            found.append(Finding("error", "pictures", message))
+            advice = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
+            message = stereo_layout.MIXED.get(self._layout, advice)
+            findings.append(Finding("error", "pictures", message))
         combed = [] if self._layout else self._combed  # rows of two cameras differ as two fields do
         for times, fault in (
             (self._damaged, f"damaged in the video's file, of {self._decoded}: they are lost; copy it again"),
             (combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
-            ([at[k] for k in sorted(again)], "the previous one again: frozen or doubled"),
+            ([time_s[k] for k in sorted(repeats)], "the previous one again: frozen or doubled"),
             (cuts, "unlike their neighbours: are frames missing, or is there a cut, a bump or other light?"),
         ):
             if times:
-                some = ", ".join(f"{t:.2f}" for t in times[:_SOME]) + (", ..." if len(times) > _SOME else "")
-                found.append(Finding("warning", "pictures", f"{len(times)} pictures ({some} s) are {fault}"))
-        return found
+                examples = ", ".join(f"{t:.2f}" for t in times[:_MAX_LISTED])
+                examples += ", ..." if len(times) > _MAX_LISTED else ""
+                message = f"{len(times)} pictures ({examples} s) are {fault}"
+                findings.append(Finding("warning", "pictures", message))
+        return findings
 
 
-def _coarse(rgb: Pixels) -> Map:
+def _average_squares(rgb: Pixels) -> Map:
     """A picture (H, W, 3) averaged over squares of `_STRIDE` px."""
     height, width = (max(side // _STRIDE, 1) for side in rgb.shape[:2])
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.float32)
@@ -246,12 +255,12 @@ def _coarse(rgb: Pixels) -> Map:
 def _is_periodic(k: int, peaks: set[int], change: Floats) -> bool:
     """Whether the k-th of the changes (T,) is one of three `peaks` of equal height at equal distances."""
     for period in range(Limits.period[0], Limits.period[1] + 1):
-        for three in (
+        for triple in (
             (k - period, k, k + period),
             (k - 2 * period, k - period, k),
             (k, k + period, k + 2 * period),
         ):
-            if peaks.issuperset(three) and np.ptp(np.log(change[list(three)])) < np.log(Limits.alike):
+            if peaks.issuperset(triple) and np.ptp(np.log(change[list(triple)])) < np.log(Limits.alike):
                 return True
     return False
 
@@ -265,5 +274,5 @@ def _detail(grey: Map, finer: float, coarser: float) -> Map:
 def _grid(lines: Map) -> float:
     """Mean step between columns (H, W) on a grid of 8 px, over the median of the eight possible grids."""
     steps = np.abs(np.diff(lines, axis=1)).mean(axis=0)
-    each = [float(steps[k::8].mean()) for k in range(8)]
-    return max(each) / max(float(np.median(each)), 1e-6)
+    grid_means = [float(steps[k::8].mean()) for k in range(8)]
+    return max(grid_means) / max(float(np.median(grid_means)), 1e-6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from synth.flow.confidence import add_deviation
 from synth.flow.recording.camera_path import CameraPath, CameraTracker, Course, describe_course
-from synth.flow.recording.find_pulse import in_cells
+from synth.flow.recording.find_pulse import average_cells
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame
 from synth.flow.recording.shared_motion import SharedMotion
 
@@ -36,8 +36,8 @@ class RegisterCamera:
 
     def describe(self) -> list[str]:
         """Sentences on the camera's motion, after the last frame."""
-        found = self._tracker.describe(self._rest.shrink)
-        return found + _describe_on_tissue(self._course, self._rest)
+        sentences = self._tracker.describe(self._rest.shrink)
+        return sentences + _describe_on_tissue(self._course, self._rest)
 
 
 class RegisterOnTissue:
@@ -53,7 +53,7 @@ class RegisterOnTissue:
         """The frame without camera motion in flow and picture."""
         if not frame.trusted or frame.time_s is None or frame.is_rest:
             return frame
-        cells = in_cells(frame.flow, frame.confidence * self._rest.tissue)
+        cells = average_cells(frame.flow, frame.confidence * self._rest.tissue)
         camera = self._shared.add(frame.time_s, *cells)
         if camera is None:
             return frame
@@ -67,5 +67,5 @@ class RegisterOnTissue:
 
 
 def _describe_on_tissue(course: Course, rest: RestFrame) -> list[str]:
-    why = "it is estimated on tissue alone, which contacts and pulsation move too"
-    return [f"{describe_course(course, rest.shrink)}; {why}"] if course else []
+    caveat = "it is estimated on tissue alone, which contacts and pulsation move too"
+    return [f"{describe_course(course, rest.shrink)}; {caveat}"] if course else []

@@ -20,8 +20,8 @@ from synth.flow.stereo.rig import Rectified
 
 _SAME = 0.2  # share of the left picture's change below which the right picture is frozen
 _COPY = 0.03  # share of the picture's detail: the noise of two cameras differs by more
-_LEAST_TOOL = 300  # px
-_NEAR = np.ones((25, 25), np.uint8)
+_MIN_TOOL = 300  # px
+_KERNEL = np.ones((25, 25), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -71,56 +71,62 @@ class RightPictures:
             return
         if self._last is not None:  # without noise, of which a camera out of focus or frozen has less or more
             pairs = zip((left, right), self._last[:2], strict=True)
-            change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)
-            self._frozen += other < _SAME * change
+            left_change, right_change = (
+                _change(*(cv2.GaussianBlur(picture, (0, 0), 3) for picture in pair)) for pair in pairs
+            )
+            self._frozen += right_change < _SAME * left_change
         self._last = left, right, self._video.rest.tissue & ~masked
         tool = frame.instruments
-        if tool.sum() > max(_LEAST_TOOL, self._largest):
+        if tool.sum() > max(_MIN_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 
     @property
     def quality(self) -> PairQuality | None:
         """The quality over all frames; None: no such camera, or the rest frame could not be used."""
         camera = self._video.stereo
-        found = None if camera is None else camera.quality
-        if found is None:
+        quality = None if camera is None else camera.quality
+        if quality is None:
             return None
         if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
-            return PairQuality(**vars(found))
-        numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
+            return PairQuality(**vars(quality))
+        numbers = quality.baseline_mm, quality.epipolar_px, quality.mm_per_px, quality.noise_mm
         pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
-        rows, moved = self._last_rows_px(camera.stereo.rectified), tuple(camera.describe())
-        return PairQuality(*numbers, *pair, *self._timing.find_lag_s(), rows, self._sharpness, moved)
+        rows_px, motion = self._last_rows_px(camera.stereo.rectified), tuple(camera.describe())
+        return PairQuality(*numbers, *pair, *self._timing.find_lag_s(), rows_px, self._sharpness, motion)
 
     def _last_rows_px(self, rectified: Rectified) -> float:
         if self._last is None:
             return 0.0
         *pair, tissue = self._last
-        found = _match(rectified, pair, rectified.flags(tissue, 0), np.ones_like(tissue), refine=True)
-        return 0.0 if found is None else found.epipolar_px
+        rest_match = _match(rectified, pair, rectified.flags(tissue, 0), np.ones_like(tissue), refine=True)
+        return 0.0 if rest_match is None else rest_match.epipolar_px
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
         if self._tool is None:
             return 0.0
         tool, *pair = self._tool
-        everywhere = np.ones(tool.shape, bool)
-        found = _match(rectified, pair, everywhere, everywhere, refine=False)
-        if found is None:
+        full_mask = np.ones(tool.shape, bool)
+        rest_match = _match(rectified, pair, full_mask, full_mask, refine=False)
+        if rest_match is None:
             return 0.0
-        inner = found.found & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)
-        around = found.found & ~rectified.flags(tool, 0) & (cv2.dilate(inner.astype(np.uint8), _NEAR) > 0)
-        if min(inner.sum(), around.sum()) < _LEAST_TOOL / 2:
+        inner = rest_match.matched & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)
+        surroundings = (
+            rest_match.matched & ~rectified.flags(tool, 0) & (cv2.dilate(inner.astype(np.uint8), _KERNEL) > 0)
+        )
+        if min(inner.sum(), surroundings.sum()) < _MIN_TOOL / 2:
             return 0.0
-        return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
+        return float(np.median(rest_match.disparity[surroundings]) - np.median(rest_match.disparity[inner]))
 
 
 def _match(
     rectified: Rectified, pair: list[Pixels], left: Mask, right: Mask, *, refine: bool
 ) -> rest.Rest | None:
     """`rest.match` of two pictures; None: too little in common."""
-    one, other = (rectified.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(pair))
+    left_grey, right_grey = (
+        rectified.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(pair)
+    )
     with suppress(UserError):
-        return rest.match(one, other, left, right, refine=refine)
+        return rest.match(left_grey, right_grey, left, right, refine=refine)
     return None
 
 
@@ -130,6 +136,6 @@ def _sharpness(rgb: Pixels) -> float:
     return float((levels[0] - levels[1]).std() / max((levels[2] - levels[3]).std(), 1e-6))
 
 
-def _change(one: Pixels, other: Pixels) -> float:
+def _change(first: Pixels, second: Pixels) -> float:
     """Mean difference of two pictures [grey levels]."""
-    return float(cv2.absdiff(np.ascontiguousarray(one), np.ascontiguousarray(other)).mean())
+    return float(cv2.absdiff(np.ascontiguousarray(first), np.ascontiguousarray(second)).mean())

@@ -17,7 +17,7 @@ from synth.flow.recording.mask import MaskRight
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Intrinsics, StereoRig
-from synth.flow.stereo.stereo_track import Moved, StereoTracker
+from synth.flow.stereo.stereo_track import Motion3D, StereoTracker
 from synth.video.read_video import Picture, shrink_picture
 
 
@@ -76,8 +76,8 @@ class RightCamera:
 
         UserError: a missing rest picture, too few or unreadable pictures, a calibration that doesn't fit.
         """
-        if not frame.trusted or (right := self._right(frame)) is None:
-            return _lost(frame)
+        if not frame.trusted or (right := self._read_right(frame)) is None:
+            return _mark_lost(frame)
         tissue = self._rest.tissue
         masked = frame.hidden
         if self.stereo is None or self._camera is None:
@@ -85,7 +85,7 @@ class RightCamera:
             hidden = self._mask.mask_rest()
             self.stereo = self._begin(frame.rgb, right, masked, hidden)
             self._camera = CameraTracker(right, self.stereo.right_tissue(), hidden)
-            return replace(frame, right=right, motion=Moved.nothing(tissue.shape))
+            return replace(frame, right=right, motion=Motion3D.zeros(tissue.shape))
         # Aligning both cameras' surroundings to rest removes motion of the rig relative to the tissue.
         view = self._camera.find(right, frame.time_s) or frame.camera
         right = right if view is None else view.undo(right)
@@ -93,9 +93,9 @@ class RightCamera:
         hidden = self._mask.mask(right, self.stereo.right_tissue())
         if view is not None:
             hidden |= view.outside(tissue.shape)
-        moved = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
-        self._noise.append(_noise(moved, tissue))
-        return replace(frame, right=right, motion=moved)
+        motion = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
+        self._noise.append(_noise(motion, tissue))
+        return replace(frame, right=right, motion=motion)
 
     def describe(self) -> list[str]:
         """Sentences on this camera's motion, after the last frame."""
@@ -105,29 +105,33 @@ class RightCamera:
         """Depth (h, w) in the last frame, NaN where unknown, by stereo matching; None: unknown."""
         if self.stereo is None or self._pair is None:
             return None
-        r, anywhere = self.stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
+        r, full_mask = self.stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
         left, right = (r.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(self._pair))
         try:
-            found = match(left, right, anywhere, anywhere, refine=False)
+            rest_match = match(left, right, full_mask, full_mask, refine=False)
         except UserError:
             return None
-        return r.back(np.where(found.found, r.depth(found.disparity), np.nan).astype(np.float32))
+        return r.unrectify(
+            np.where(rest_match.matched, r.depth(rest_match.disparity), np.nan).astype(np.float32)
+        )
 
     def _begin(self, left: Pixels, right: Pixels, masked: Mask, hidden: Mask) -> StereoTracker:
         """Starts tracking from the rest pictures; UserError if they don't match, naming a flip that would."""
-        rig, tissue = _smaller_rig(self._source.rig(self._rest.size), self._rest), self._rest.tissue
+        rig, tissue = _shrink_rig(self._source.rig(self._rest.size), self._rest), self._rest.tissue
         try:
             return StereoTracker(rig, left[None], right[None], masked, hidden, tissue)
         except UserError as error:
-            for how, turned in (("mirrored", right[:, ::-1]), ("upside down", right[::-1, ::-1])):
+            for flip, flipped in (("mirrored", right[:, ::-1]), ("upside down", right[::-1, ::-1])):
                 try:
-                    StereoTracker(rig, left[None], np.ascontiguousarray(turned)[None], masked, hidden, tissue)
+                    StereoTracker(
+                        rig, left[None], np.ascontiguousarray(flipped)[None], masked, hidden, tissue
+                    )
                 except UserError:
                     continue
-                raise UserError(f"{self._name}: the right camera's pictures are {how}") from None
+                raise UserError(f"{self._name}: the right camera's pictures are {flip}") from None
             raise error
 
-    def _right(self, frame: FrameMotion) -> Pixels | None:
+    def _read_right(self, frame: FrameMotion) -> Pixels | None:
         """The right camera's picture of a frame, downsampled as the video is; None: missing."""
         for picture in self._pictures:
             if picture.index > frame.index and not frame.is_rest:
@@ -159,25 +163,25 @@ class DepthCamera:
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """The frame with motion in three dimensions, see `RightCamera.process`."""
-        if not frame.trusted or (large := self._source.read(frame, self._rest.size)) is None:
-            return _lost(frame)
-        tissue, depth = self._rest.tissue, _shrink_depth(large, self._rest.shrink)
+        if not frame.trusted or (depth_picture := self._source.read(frame, self._rest.size)) is None:
+            return _mark_lost(frame)
+        tissue, depth = self._rest.tissue, _shrink_depth(depth_picture, self._rest.shrink)
         self._last = np.where(depth > 0, depth, np.nan).astype(np.float32)
         masked = frame.hidden
         if self._tracker is None:
-            K = smaller_K(self._source.K(self._rest.size), self._rest.shrink)
+            K = shrink_K(self._source.K(self._rest.size), self._rest.shrink)
             self._tracker = DepthTracker(K, depth, masked, tissue)
-            return replace(frame, motion=Moved.nothing(tissue.shape))
-        moved = self._tracker.step(depth, masked, frame.flow, frame.confidence)
-        self._noise.append(_noise(moved, tissue))
-        return replace(frame, motion=moved)
+            return replace(frame, motion=Motion3D.zeros(tissue.shape))
+        motion = self._tracker.step(depth, masked, frame.flow, frame.confidence)
+        self._noise.append(_noise(motion, tissue))
+        return replace(frame, motion=motion)
 
     def depth_mm(self) -> Map | None:
         """Depth (h, w) in the last frame, NaN where unknown; None: unknown."""
         return self._last
 
 
-def smaller_K(K: Floats, shrink: int) -> Floats:
+def shrink_K(K: Floats, shrink: int) -> Floats:
     """K after averaging shrink x shrink pixels; a picture starts half a pixel before its first centre."""
     out = K / shrink
     out[:2, 2] = (K[:2, 2] + 0.5) / shrink - 0.5
@@ -185,9 +189,11 @@ def smaller_K(K: Floats, shrink: int) -> Floats:
     return np.asarray(out, np.float64)
 
 
-def _smaller_rig(rig: StereoRig, rest: RestFrame) -> StereoRig:
+def _shrink_rig(rig: StereoRig, rest: RestFrame) -> StereoRig:
     """The rig for pictures downsampled and cropped as by `shrink_picture`."""
-    left, right = (Intrinsics(smaller_K(one.K, rest.shrink), one.distortion) for one in (rig.left, rig.right))
+    left, right = (
+        Intrinsics(shrink_K(camera.K, rest.shrink), camera.distortion) for camera in (rig.left, rig.right)
+    )
     size = (rest.size[1] // rest.shrink, rest.size[0] // rest.shrink)
     return StereoRig(left, right, rig.rotation, rig.translation, size)
 
@@ -200,12 +206,12 @@ def _shrink_depth(depth: Map, shrink: int) -> Map:
     return np.where(share > 0.5, total / np.maximum(share, 1e-6), 0).astype(np.float32)
 
 
-def _lost(frame: FrameMotion) -> FrameMotion:
-    return replace(frame, trusted=False, motion=Moved.nothing(frame.confidence.shape))
+def _mark_lost(frame: FrameMotion) -> FrameMotion:
+    return replace(frame, trusted=False, motion=Motion3D.zeros(frame.confidence.shape))
 
 
-def _noise(moved: Moved, tissue: Mask) -> float:
-    return float(np.median(moved.deviation[..., 2][tissue]))
+def _noise(motion: Motion3D, tissue: Mask) -> float:
+    return float(np.median(motion.deviation[..., 2][tissue]))
 
 
 def _median(values: list[float]) -> float:

@@ -32,17 +32,17 @@ class StereoTiming:
         greys = [self._rectified.picture(image.luminance(rgb), k) for k, rgb in enumerate((left, right))]
         now = [cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX) for grey in greys]
         pairs = zip(now, self._last or now, strict=True)
-        self._changes.append(np.array([np.abs(one - last).mean(axis=1) for one, last in pairs]))
+        self._changes.append(np.array([np.abs(picture - last).mean(axis=1) for picture, last in pairs]))
         self._last = now
         self._time_s.append(time_s)
 
     def find_lag_s(self) -> tuple[float, float | None]:
         """Lag [s], negative: early, 0: none or unknown; and the time [s] from which on, None: the start."""
-        lag, since = find_lag(*np.array(self._changes, np.float64)[1:].swapaxes(0, 1))
+        lag, first_frame = find_lag(*np.array(self._changes, np.float64)[1:].swapaxes(0, 1))
         if not lag:
             return 0.0, None
         step_s = float(np.median(np.diff(self._time_s)))
-        return lag * step_s, self._time_s[since + 1] if since > _LEAST_FRAMES else None
+        return lag * step_s, self._time_s[first_frame + 1] if first_frame > _LEAST_FRAMES else None
 
 
 def find_lag(left: Floats, right: Floats) -> tuple[float, int]:
@@ -51,27 +51,28 @@ def find_lag(left: Floats, right: Floats) -> tuple[float, int]:
     frames = np.arange(len(left))
     if len(frames) < 2 * _LEAST_FRAMES:
         return 0.0, 0
-    left, right = (np.maximum(one - np.median(one, axis=0), 0) for one in (left, right))  # above the noise
-    left, right = (one / max(float(np.linalg.norm(one)), 1e-9) for one in (left, right))
+    # Above the noise.
+    left, right = (np.maximum(change - np.median(change, axis=0), 0) for change in (left, right))
+    left, right = (change / max(float(np.linalg.norm(change)), 1e-9) for change in (left, right))
 
-    def apart(lag: float) -> Floats:
+    def measure_difference(lag: float) -> Floats:
         """Squared difference of the cameras' changes, (T,); NaN beyond the video."""
-        at = frames - lag
-        below = np.clip(at.astype(int), 0, len(frames) - 2)
-        share = (at - below)[:, None]
-        off = np.square(right - (1 - share) * left[below] - share * left[below + 1]).sum(axis=1)
-        return np.where((at >= 0) & (at <= frames[-1]), off, np.nan)
+        positions = frames - lag
+        below = np.clip(positions.astype(int), 0, len(frames) - 2)
+        share = (positions - below)[:, None]
+        difference = np.square(right - (1 - share) * left[below] - share * left[below + 1]).sum(axis=1)
+        return np.where((positions >= 0) & (positions <= frames[-1]), difference, np.nan)
 
-    best, answer, now = _BETTER, (0.0, 0), apart(0.0)
+    best_share, best_lag, prompt_difference = _BETTER, (0.0, 0), measure_difference(0.0)
     for lag in np.arange(-_MOST, _MOST + _STEP, _STEP):
-        other = apart(float(lag))
-        both = np.isfinite(other)
-        if abs(lag) < _LEAST or both.sum() < 2 * _LEAST_FRAMES or not now[both].any():
+        late_difference = measure_difference(float(lag))
+        is_known = np.isfinite(late_difference)
+        if abs(lag) < _LEAST or is_known.sum() < 2 * _LEAST_FRAMES or not prompt_difference[is_known].any():
             continue
-        prompt, late = np.where(both, now, 0.0), np.where(both, other, 0.0)
+        prompt, late = np.where(is_known, prompt_difference, 0.0), np.where(is_known, late_difference, 0.0)
         mixed = np.cumsum(prompt) - prompt + np.cumsum(late[::-1])[::-1]  # if late from each frame on
-        since = int(np.argmin(mixed[:-_LEAST_FRAMES]))
-        share = float(np.sqrt(mixed[since] / prompt.sum()))
-        if share < best:
-            best, answer = share, (float(lag), since)
-    return answer
+        first_frame = int(np.argmin(mixed[:-_LEAST_FRAMES]))
+        share = float(np.sqrt(mixed[first_frame] / prompt.sum()))
+        if share < best_share:
+            best_share, best_lag = share, (float(lag), first_frame)
+    return best_lag

@@ -86,8 +86,8 @@ class VideoPass:
         self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
-        given = footage.tool, footage.expected, footage.lookalikes
-        self._mask = MaskFrame(rest, settings.masks, *given)
+        mask_sources = footage.tool, footage.expected, footage.lookalikes
+        self._mask = MaskFrame(rest, settings.masks, *mask_sources)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
         self.summary.rest_masked = self._first.hidden if self._first.hidden.any() else None
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
@@ -129,7 +129,7 @@ class VideoPass:
         for picture in self.decoder.frames():
             time_s = picture.time_s or 0.0
             while waiting and self._is_ready(waiting[0][1], time_s):
-                yield self._finish(self._with_flow(*waiting.popleft()))
+                yield self._finish(self._receive_flow(*waiting.popleft()))
             if self._pace is not None and not self._pace.is_due(picture.index, time_s):
                 continue
             if self._register is None:
@@ -138,9 +138,9 @@ class VideoPass:
             frame = self._prepare(picture, self._register)
             waiting.append((frame, self._flow.submit(frame.rgb, frame.hidden)))
             if len(waiting) > self._flow.ahead or self._is_done(waiting[0][1]):
-                yield self._finish(self._with_flow(*waiting.popleft()))
-        for one in waiting:
-            yield self._finish(self._with_flow(*one))
+                yield self._finish(self._receive_flow(*waiting.popleft()))
+        for submission in waiting:
+            yield self._finish(self._receive_flow(*submission))
 
     def _begin(self) -> FrameMotion:
         """Starts the flow; returns the rest frame, with confidence where it shows tissue."""
@@ -154,10 +154,10 @@ class VideoPass:
 
     def _prepare(self, picture: Picture, register: RegisterCamera) -> FrameMotion:
         """A frame after the stages before flow."""
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         frame = self._process("camera", register, self.decoder.process(picture))
         frame = self._process("mask", self._mask, frame)
-        return replace(frame, masking_s=time.perf_counter() - began)
+        return replace(frame, masking_s=time.perf_counter() - start_s)
 
     def _is_ready(self, flow: Future[FrameMotion], time_s: float) -> bool:
         """Waits for a flow until a frame of this time arrives; returns whether the flow is ready."""
@@ -176,11 +176,11 @@ class VideoPass:
             return True
         return False
 
-    def _with_flow(self, frame: FrameMotion, flow: Future[FrameMotion]) -> FrameMotion:
-        found = with_flow(frame, flow.result())
-        self.watch.add("flow", found.cpu_s, found.wall_s)
-        self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
-        return found
+    def _receive_flow(self, frame: FrameMotion, flow: Future[FrameMotion]) -> FrameMotion:
+        tracked = with_flow(frame, flow.result())
+        self.watch.add("flow", tracked.cpu_s, tracked.wall_s)
+        self.peak_bytes = max(self.peak_bytes, tracked.peak_bytes)
+        return tracked
 
     def _finish(self, frame: FrameMotion) -> FrameMotion:
         """A frame after the stages after flow."""
@@ -224,12 +224,12 @@ class VideoPass:
             fault = f"the rest frame is {self.rest.fault}"
         elif self.summary.frames and not self.decoder.faults.changes:
             fault = "the picture never changes"
-        bad = [Finding("error", "pictures", fault)] if fault else []
+        faults = [Finding("error", "pictures", fault)] if fault else []
         pictures = [] if fault else self.decoder.faults.findings()
         foreground = [] if self._foreground is None else self._foreground.findings
-        found = [*bad, *self.rest.findings, *foreground, *pictures]
-        moved = [one.describe() for one in (self._register, self._on_tissue) if one is not None]
-        return found + [Finding("warning", "camera", text) for text in chain(*moved)]
+        findings = [*faults, *self.rest.findings, *foreground, *pictures]
+        sentences = [stage.describe() for stage in (self._register, self._on_tissue) if stage is not None]
+        return findings + [Finding("warning", "camera", text) for text in chain(*sentences)]
 
     @property
     def notes(self) -> list[str]:
@@ -237,5 +237,5 @@ class VideoPass:
         shrink, decoder = self.rest.shrink, self.decoder
         shrunk = [f"pictures are downsampled {shrink} times for flow"] if shrink > 1 else []
         count = len(decoder.decoded)
-        left = [f"left out: {n} of {count} frames {why}" for why, n in decoder.left_out.items()]
-        return shrunk + left
+        omissions = [f"left out: {n} of {count} frames {reason}" for reason, n in decoder.left_out.items()]
+        return shrunk + omissions

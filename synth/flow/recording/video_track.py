@@ -37,7 +37,7 @@ from synth.flow.recording.frame_motion import FrameMotion, Size
 from synth.flow.recording.harmonic_fit import Span
 from synth.flow.recording.right_pictures import RightPictures
 from synth.flow.recording.video_pass import VideoPass
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 from synth.system.stopwatch import Stopwatch
 
 _KEPT_BITS = 12
@@ -58,32 +58,36 @@ class FrameFile:
 
     def add(self, frame: FrameMotion) -> None:
         """Appends a frame; of a right camera only the motion is kept. UserError: the disk is full."""
-        arrays: dict[str, Array] = {name: self._rounded(getattr(frame, name)) for name in _ROUNDED}
+        arrays: dict[str, Array] = {name: self._round_bits(getattr(frame, name)) for name in _ROUNDED}
         if frame.motion is not None:
-            parts = frame.motion.motion, frame.motion.deviation
-            arrays |= dict(zip(("motion", "deviation"), map(self._rounded, parts), strict=True))
+            planes = frame.motion.motion, frame.motion.deviation
+            arrays |= dict(zip(("motion", "deviation"), map(self._round_bits, planes), strict=True))
         arrays |= {name: getattr(frame, name) for name in _FLAGS if getattr(frame, name) is not None}
         arrays["rgb"] = frame.rgb
-        places = [(name, *self._write(array), array.dtype.str, array.shape) for name, array in arrays.items()]
+        entries = [
+            (name, *self._write(array), array.dtype.str, array.shape) for name, array in arrays.items()
+        ]
         empty = np.zeros((0, 0), np.float32)
-        bare = replace(frame, flow=empty, confidence=empty, motion=None, masked=None, tool=None, right=None)
-        self._frames.append((replace(bare, rgb=np.zeros((0, 0, 3), np.uint8)), places))
+        record = replace(frame, flow=empty, confidence=empty, motion=None, masked=None, tool=None, right=None)
+        self._frames.append((replace(record, rgb=np.zeros((0, 0, 3), np.uint8)), entries))
 
     def read(self) -> Iterator[FrameMotion]:
         """The frames in order."""
-        for bare, places in self._frames:
-            arrays = {name: self._read(start, size, kind, shape) for name, start, size, kind, shape in places}
-            moved = [arrays.pop(name) for name in ("motion", "deviation") if name in arrays]
-            fields: dict[str, Any] = {**arrays, "motion": Moved(*moved) if moved else None}
-            yield replace(bare, **fields)
+        for record, entries in self._frames:
+            arrays = {
+                name: self._read(start, size, kind, shape) for name, start, size, kind, shape in entries
+            }
+            planes = [arrays.pop(name) for name in ("motion", "deviation") if name in arrays]
+            fields: dict[str, Any] = {**arrays, "motion": Motion3D(*planes) if planes else None}
+            yield replace(record, **fields)
 
     def close(self) -> None:
         """Gives the disk's space back, as the end of this object does."""
         self._finalizer()
 
-    def _rounded(self, values: Array) -> Array:
-        given = np.ascontiguousarray(values, np.float32)
-        return np.asarray(self._round.encode(given)).view(np.float32).reshape(values.shape)
+    def _round_bits(self, values: Array) -> Array:
+        floats = np.ascontiguousarray(values, np.float32)
+        return np.asarray(self._round.encode(floats)).view(np.float32).reshape(values.shape)
 
     def _write(self, array: Array) -> tuple[int, int]:
         data, start = self._pack.encode(np.ascontiguousarray(array)), self.bytes
@@ -91,9 +95,9 @@ class FrameFile:
             self._file.seek(start)
             self._file.write(data)
         except OSError as error:
-            where = tempfile.gettempdir()
+            folder = tempfile.gettempdir()
             raise UserError(
-                f"{where}: the motion of the video can't be kept there ({error.strerror}): free some space, "
+                f"{folder}: the motion of the video can't be kept there ({error.strerror}): free some space, "
                 "or set TMPDIR to another folder"
             ) from error
         self.bytes += len(data)
@@ -112,7 +116,7 @@ class VideoTrack:
     """Rest frame, findings and summary; of the second pass if there were two."""
     search: PulseSearch | None
     """Search for heart and breath; None: not requested."""
-    kept: FrameFile
+    frame_file: FrameFile
     pair: RightPictures | None
     """Comparison of the pictures of both cameras; None: not requested."""
 
@@ -130,8 +134,8 @@ class VideoTrack:
     def frames(self) -> Iterator[FrameMotion]:
         """The tracked frames without pulsation, the rest frame first; without the right camera's pictures."""
         if self.removed is None:
-            return self.kept.read()
-        return map(Detrend(self.removed, self.video.mm_per_px).process, self.kept.read())
+            return self.frame_file.read()
+        return map(Detrend(self.removed, self.video.mm_per_px).process, self.frame_file.read())
 
     def __enter__(self) -> VideoTrack:
         return self
@@ -139,7 +143,7 @@ class VideoTrack:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.kept.close()
+        self.frame_file.close()
 
 
 def track_video(
@@ -164,23 +168,23 @@ def track_video(
     if footage.tissue is None:
         footage = _with_tissue(footage, settings, watch)
     first = VideoPass(footage, settings, flow=flow, watch=watch, progress=progress)
-    kept, pair = _keep(first, compare_cameras)
+    frame_file, pair = _store_frames(first, compare_cameras)
     search = first.search(free_s)
     if search is None or search.camera is None:
-        return VideoTrack(first, search, kept, pair)
-    kept.close()
+        return VideoTrack(first, search, frame_file, pair)
+    frame_file.close()
     second = VideoPass(footage, settings, search.camera, flow=flow, watch=watch, progress=progress)
-    return VideoTrack(second, search, *_keep(second, compare_cameras))
+    return VideoTrack(second, search, *_store_frames(second, compare_cameras))
 
 
-def _keep(video: VideoPass, compare_cameras: bool) -> tuple[FrameFile, RightPictures | None]:
-    kept, pair = FrameFile(), RightPictures(video) if compare_cameras else None
+def _store_frames(video: VideoPass, compare_cameras: bool) -> tuple[FrameFile, RightPictures | None]:
+    frame_file, pair = FrameFile(), RightPictures(video) if compare_cameras else None
     for frame in video.frames():
         if pair is not None:  # here: the right camera's pictures aren't kept
             pair.add(frame)
         with video.watch.stage("store"):
-            kept.add(frame)
-    return kept, pair
+            frame_file.add(frame)
+    return frame_file, pair
 
 
 def _with_lookalikes(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
@@ -191,8 +195,8 @@ def _with_lookalikes(footage: Footage, settings: RecordingFlowSettings, watch: S
     if decoder.rest.fault or not search.regions:
         return footage
     with watch.stage("decode"):
-        few = replace(bare, only=choose_frames(bare))
-    decoder = Decoder(few, plain, watch, lambda done: None)
+        excerpt = replace(bare, only=choose_frames(bare))
+    decoder = Decoder(excerpt, plain, watch, lambda done: None)
     with watch.stage("mask"):
         for number, picture in enumerate(decoder.frames()):
             if number % 2 == 0:
@@ -202,14 +206,14 @@ def _with_lookalikes(footage: Footage, settings: RecordingFlowSettings, watch: S
 
 def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
     """The footage with the tissue that is found in a few of its frames."""
-    found = find_tissue(footage, settings, watch)
-    if found is None:
+    result = find_tissue(footage, settings, watch)
+    if result is None:
         return footage
-    mask, finding = found
+    mask, finding = result
 
     def tissue(size: Size) -> Mask:
-        whole = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
-        return np.asarray(whole > 0)
+        resized = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+        return np.asarray(resized > 0)
 
     return replace(footage, tissue=tissue, findings=(finding,))
 
@@ -221,8 +225,8 @@ def find_tissue(
     frames; None if there is nothing to track. UserError: unreadable video."""
     watch = watch or Stopwatch()
     with watch.stage("decode"):
-        few = replace(footage, only=choose_frames(footage), depth=None)
-    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
+        excerpt = replace(footage, only=choose_frames(footage), depth=None)
+    video = VideoPass(excerpt, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
     if video.rest.fault:
         return None
     search = TissueSearch(video.rest)

@@ -20,8 +20,8 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Ste
     chessboard; 1 is metres for Kalibr. Raises UserError if the file cannot be read or does not contain two
     valid cameras, or if the distance between them is implausible.
     """
-    left, right, rotation, translation, stated = camera_file.read_pair(path, size)
-    unit = stated if stated and mm_per_unit == 1 else mm_per_unit
+    left, right, rotation, translation, stated_unit = camera_file.read_pair(path, size)
+    unit = stated_unit if stated_unit and mm_per_unit == 1 else mm_per_unit
     rig = StereoRig(Intrinsics(*left), Intrinsics(*right), rotation, unit * translation, size)
     low, high = _BASELINE_MM
     if not low <= rig.baseline_mm <= high:

@@ -27,7 +27,7 @@ FEATURES = (
 CHANNELS = len(FEATURES)
 VECTORS = ((FEATURES.index("motion x"), FEATURES.index("motion y")),)  # as in `synth.flow.correction`
 UNIT_MM = 0.1  # unit of the network's outputs
-_FARTHEST_MM = 0.5  # limit of a linearised step
+_MAX_STEP_MM = 0.5  # limit of a linearised step
 
 
 def describe(
@@ -39,24 +39,25 @@ def describe(
     cell that is unmasked tissue in the left picture; `spread`: (h, w) px, deviation of a flow component;
     `px_per_mm` as in `Solver.solve`; `mm_per_px`: size of a pixel at the tissue.
     """
-    coarse, across = solver.coarse, [mm_per_px * solver.coarse(part) for part in flow]
-    here = coarse(change.px)
-    rows = [coarse(change.visible), visible, *across, -here / px_per_mm]
-    left = change.pull - change.precision * here
+    average, lateral = solver.average_cells, [mm_per_px * solver.average_cells(part) for part in flow]
+    cell_change = average(change.px)
+    planes = [average(change.visible), visible, *lateral, -cell_change / px_per_mm]
+    residual_pull = change.pull - change.precision * cell_change
     for side in _WINDOWS:
         precision, pull = (
-            cv2.blur(a, (side, side), borderType=cv2.BORDER_REPLICATE) for a in (change.precision, left)
+            cv2.blur(plane, (side, side), borderType=cv2.BORDER_REPLICATE)
+            for plane in (change.precision, residual_pull)
         )
         step = -pull / (precision + 1) / px_per_mm
-        rows += [_FARTHEST_MM * np.tanh(step / _FARTHEST_MM), -np.log(px_per_mm * np.sqrt(precision + 1))]
+        planes += [_MAX_STEP_MM * np.tanh(step / _MAX_STEP_MM), -np.log(px_per_mm * np.sqrt(precision + 1))]
     misfit = np.clip(cv2.blur(change.misfit, (3, 3)), 0.1, 30)
     strain, plate = solver.steepness(flow) + 0.002, change.deviation / px_per_mm
-    rows += [np.log(part) for part in (plate, misfit, mm_per_px * spread, strain)]
-    return np.stack(rows).astype(np.float32)
+    planes += [np.log(part) for part in (plate, misfit, mm_per_px * spread, strain)]
+    return np.stack(planes).astype(np.float32)
 
 
 def correct(features: Map) -> tuple[Map, Map]:
     """Correction of the depth motion and its deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w)."""
     height, width = features.shape[1:]
-    found = correction.predict(WEIGHTS, features)[:, :height, :width]
-    return UNIT_MM * found[0], UNIT_MM * np.exp(0.5 * found[1].clip(-8, 5))
+    output = correction.predict(WEIGHTS, features)[:, :height, :width]
+    return UNIT_MM * output[0], UNIT_MM * np.exp(0.5 * output[1].clip(-8, 5))

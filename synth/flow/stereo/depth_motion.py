@@ -35,8 +35,8 @@ from synth.system.jit import vectorised
 
 _FREEDOM = np.float32(4.0)  # degrees of freedom of Student's distribution
 _CHANNELS = np.float32(3.0)
-_AROUND = (5, 5)  # cells over which precision is averaged
-_ALIKE_PX = 40.0  # number of pixels over which errors of samples are correlated
+_WINDOW = (5, 5)  # cells over which precision is averaged
+_CORRELATED_PX = 40.0  # number of pixels over which errors of samples are correlated
 _MEDIAN = 0.4549  # median of the square of a standard normal variable
 _ONE, _EIGHT, _TWELFTH, _HALF = np.float32(1), np.float32(8), np.float32(1 / 12), np.float32(0.5)
 
@@ -47,8 +47,8 @@ class DepthMotion:
     columns: int = 40  # cells across the picture
     bend_mm: float = 0.004  # k of unstrained tissue: second differences of depth motion between cells
     strained_mm: float = 2.0  # added to k per px/px of the gradient of the flow
-    cold: int = 4  # linearisations from zero
-    warm: int = 2  # linearisations from the frame before
+    cold_steps: int = 4  # linearisations from zero
+    warm_steps: int = 2  # linearisations from the frame before
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Change:
     @property
     def deviation(self) -> Map:
         """(h, w) px, posterior standard deviation of the plate, which ignores correlated errors."""
-        precision = cv2.blur(self.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
+        precision = cv2.blur(self.precision, _WINDOW, borderType=cv2.BORDER_REPLICATE) + 1e-3
         return np.asarray(1 / np.sqrt(8 * np.sqrt(precision * self.stiffness)), np.float32)
 
 
@@ -106,29 +106,29 @@ class Solver:
         """
         warped, visible = np.empty_like(disparity), np.empty_like(disparity)
         kernels.warp_into(pictures.left, pictures.left_usable, flow, warped, visible)
-        left_now, left_rest = _stacked(warped), _stacked(pictures.left_rest)
-        right_rest = _stacked(pictures.right_rest)
-        lefts, less = left_now + left_rest, left_now - left_rest + right_rest
+        left_now, left_rest = _stack_derivatives(warped), _stack_derivatives(pictures.left_rest)
+        right_rest = _stack_derivatives(pictures.right_rest)
+        left_sum, target = left_now + left_rest, left_now - left_rest + right_rest
         mask = pictures.rest_usable * visible
         stiffness, prior = self._prior(flow, px_per_mm)
         change = np.zeros_like(disparity) if initial is None else initial
         sums = np.zeros((4, *self.shape), np.float64)
-        here = np.empty_like(flow)
-        here[1] = flow[1]
-        for _ in range(DepthMotion.cold if initial is None else DepthMotion.warm):
-            here[0] = flow[0] - disparity - change
-            kernels.warp_into(pictures.right, pictures.right_usable, here, warped, visible)
-            both = mask * visible
-            right_now = _stacked(warped)
-            noise = _noise(right_now - less, both)
+        right_flow = np.empty_like(flow)
+        right_flow[1] = flow[1]
+        for _ in range(DepthMotion.cold_steps if initial is None else DepthMotion.warm_steps):
+            right_flow[0] = flow[0] - disparity - change
+            kernels.warp_into(pictures.right, pictures.right_usable, right_flow, warped, visible)
+            overlap = mask * visible
+            right_now = _stack_derivatives(warped)
+            noise = _noise(right_now - target, overlap)
             sums[:] = 0
-            gather(right_now, right_rest, lefts, less, both, change, noise, self.cell, sums)
+            gather(right_now, right_rest, left_sum, target, overlap, change, noise, self.cell, sums)
             np.maximum(sums[0], 0, out=sums[0])
-            change = fine(self._settled(prior, sums[0], sums[1]), self.cell, disparity.shape)
+            change = interpolate_cells(self._solve_cells(prior, sums[0], sums[1]), self.cell, disparity.shape)
         misfit = np.where(sums[3] > 0, sums[2] / np.maximum(sums[3], 1), 1)
-        lag = _lag(right_now[0] - less[0], right_now[2], flow[1], both, noise[0])
+        lag = _lag(right_now[0] - target[0], right_now[2], flow[1], overlap, noise[0])
         precision, pull = sums[:2].astype(np.float32)
-        return Change(change, precision, pull, stiffness, misfit.astype(np.float32), both, lag)
+        return Change(change, precision, pull, stiffness, misfit.astype(np.float32), overlap, lag)
 
     def smooth(self, samples: Map, weight: Map, flow: Map, px_per_mm: float) -> Change:
         """The change of given samples (H, W) px of weight (H, W) >= 0, by the same prior and Student's
@@ -137,22 +137,26 @@ class Solver:
         change = np.zeros_like(samples)
         misfit = np.ones(self.shape, np.float32)
         information, pull = np.zeros((2, *self.shape), np.float32)
-        for _ in range(DepthMotion.cold):
-            off = samples - change
+        for _ in range(DepthMotion.cold_steps):
+            residual = samples - change
             known = weight > 0
-            noise = float(np.median(np.square(off[known]))) / _MEDIAN if known.any() else 1.0
-            square = off * off / max(noise, 1e-6)
-            robust = weight * (_FREEDOM + 1) / (_FREEDOM + square) / (max(noise, 1e-6) * _ALIKE_PX)
+            noise = float(np.median(np.square(residual[known]))) / _MEDIAN if known.any() else 1.0
+            square = residual * residual / max(noise, 1e-6)
+            robust_weight = (
+                weight * (_FREEDOM + 1) / (_FREEDOM + square) / (max(noise, 1e-6) * _CORRELATED_PX)
+            )
             area = self.cell**2
-            information = area * self.coarse(robust.astype(np.float32))
-            pull = area * self.coarse((robust * samples).astype(np.float32))
-            change = fine(self._settled(prior, information, pull), self.cell, samples.shape)
-            share = self.coarse(known.astype(np.float32))
-            misfit = np.where(share > 0, self.coarse((known * square).astype(np.float32)) / (share + 1e-6), 1)
+            information = area * self.average_cells(robust_weight.astype(np.float32))
+            pull = area * self.average_cells((robust_weight * samples).astype(np.float32))
+            change = interpolate_cells(self._solve_cells(prior, information, pull), self.cell, samples.shape)
+            share = self.average_cells(known.astype(np.float32))
+            misfit = np.where(
+                share > 0, self.average_cells((known * square).astype(np.float32)) / (share + 1e-6), 1
+            )
         visible = (weight > 0).astype(np.float32)
         return Change(change, information, pull, stiffness, misfit.astype(np.float32), visible)
 
-    def _settled(self, prior: sparse.csr_matrix, information: Array, pull: Array) -> Map:
+    def _solve_cells(self, prior: sparse.csr_matrix, information: Array, pull: Array) -> Map:
         """Changes (h, w) px of the cells that minimise data and prior terms."""
         system = (prior + sparse.diags(information.ravel() + 1e-9)).tocsc()
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
@@ -167,79 +171,87 @@ class Solver:
 
     def steepness(self, flow: Map) -> Map:
         """|grad w| (h, w) [px/px] of w averaged over 3 x 3 cells, which removes the noise."""
-        coarse = [cv2.blur(self.coarse(part), (3, 3)) for part in flow]
-        slopes = [slope for part in coarse for slope in np.gradient(part)]
-        steep = np.sqrt(sum(slope * slope for slope in slopes)) / self.cell
-        return np.asarray(cv2.blur(np.asarray(steep, np.float32), (3, 3)))
+        cells = [cv2.blur(self.average_cells(part), (3, 3)) for part in flow]
+        slopes = [slope for part in cells for slope in np.gradient(part)]
+        slope_norm = np.sqrt(sum(slope * slope for slope in slopes)) / self.cell
+        return np.asarray(cv2.blur(np.asarray(slope_norm, np.float32), (3, 3)))
 
-    def coarse(self, field: Map) -> Map:
+    def average_cells(self, field: Map) -> Map:
         """Means (h, w) of a field (H, W) over cells; at the border the last row or column is repeated."""
         rows, columns = self.shape
         below, right = rows * self.cell - field.shape[0], columns * self.cell - field.shape[1]
-        wide = cv2.copyMakeBorder(field, 0, below, 0, right, cv2.BORDER_REPLICATE)
-        return np.asarray(cv2.resize(wide, (columns, rows), interpolation=cv2.INTER_AREA))
+        extended = cv2.copyMakeBorder(field, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.resize(extended, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def fine(coarse: Map, cell: int, size: tuple[int, ...]) -> Map:
+def interpolate_cells(cells: Map, cell: int, size: tuple[int, ...]) -> Map:
     """Cubic interpolation of a field (h, w) on cells to pixels (H, W)."""
-    rows, columns = coarse.shape
-    wide = cv2.resize(coarse, (columns * cell, rows * cell), interpolation=cv2.INTER_CUBIC)
-    return np.ascontiguousarray(wide[: size[0], : size[1]])
+    rows, columns = cells.shape
+    upsampled = cv2.resize(cells, (columns * cell, rows * cell), interpolation=cv2.INTER_CUBIC)
+    return np.ascontiguousarray(upsampled[: size[0], : size[1]])
 
 
 def second_differences(shape: tuple[int, int]) -> sparse.csr_matrix:
     """Matrix (3 h w, h w) of second differences by x, by y and mixed (times root 2); 0 at the border."""
 
-    def second(n: int) -> sparse.csr_matrix:
-        inner = np.ones(n)
-        inner[[0, -1]] = 0
-        return sparse.diags([inner[1:], -2 * inner, inner[:-1]], [-1, 0, 1], format="csr")
+    def second_difference(n: int) -> sparse.csr_matrix:
+        interior = np.ones(n)
+        interior[[0, -1]] = 0
+        return sparse.diags([interior[1:], -2 * interior, interior[:-1]], [-1, 0, 1], format="csr")
 
-    def first(n: int) -> sparse.csr_matrix:
-        inner = np.ones(n)
-        inner[-1] = 0
-        return sparse.diags([-inner, np.ones(n - 1)], [0, 1], format="csr")
+    def first_difference(n: int) -> sparse.csr_matrix:
+        interior = np.ones(n)
+        interior[-1] = 0
+        return sparse.diags([-interior, np.ones(n - 1)], [0, 1], format="csr")
 
     rows, columns = shape
-    along = sparse.kron(sparse.identity(rows), second(columns))
-    down = sparse.kron(second(rows), sparse.identity(columns))
-    mixed = np.sqrt(2) * sparse.kron(first(rows), first(columns))
-    return sparse.vstack([along, down, mixed]).tocsr()
+    horizontal = sparse.kron(sparse.identity(rows), second_difference(columns))
+    vertical = sparse.kron(second_difference(rows), sparse.identity(columns))
+    mixed = np.sqrt(2) * sparse.kron(first_difference(rows), first_difference(columns))
+    return sparse.vstack([horizontal, vertical, mixed]).tocsr()
 
 
-def _stacked(picture: Map) -> Map:
+def _stack_derivatives(picture: Map) -> Map:
     """(3, H, W): the picture and its derivatives by x and y."""
-    found = np.empty((3, *picture.shape), np.float32)
-    found[0] = picture
-    kernels.differentiate(picture, found[1], found[2])
-    return found
+    planes = np.empty((3, *picture.shape), np.float32)
+    planes[0] = picture
+    kernels.differentiate(picture, planes[1], planes[2])
+    return planes
 
 
 def _noise(residual: Map, mask: Map) -> Map:
     """Robust variance (3,) of each channel of (3, H, W) inside the mask, from the median."""
-    some = residual[:, ::2, ::2][:, mask[::2, ::2] > 0]
-    if not some.shape[1]:
+    samples = residual[:, ::2, ::2][:, mask[::2, ::2] > 0]
+    if not samples.shape[1]:
         return np.ones(3, np.float32)
-    return np.asarray(np.maximum(np.median(some * some, axis=1) / _MEDIAN, 1e-6), np.float32)
+    return np.asarray(np.maximum(np.median(samples * samples, axis=1) / _MEDIAN, 1e-6), np.float32)
 
 
-def _lag(residual: Map, slope: Map, down: Map, mask: Map, noise: np.float32) -> float:
+def _lag(residual: Map, slope: Map, vertical_flow: Map, mask: Map, noise: np.float32) -> float:
     """Share of the vertical motion that is missing in the right picture, as it is not synchronous.
 
     Else that motion is the same in both rectified pictures at any depth. (H, W) each: `residual` of
-    brightness, of variance `noise`; `slope`, its derivative by y; `down`, the left vertical flow [px].
+    brightness, of variance `noise`; `slope`, its derivative by y; `vertical_flow`, of the left camera [px].
     """
-    some = (slice(None, None, 2), slice(None, None, 2))
-    q, along = residual[some], (slope * down)[some]
-    weight = mask[some] / (1 + q * q / (_FREEDOM * noise))
+    stride = (slice(None, None, 2), slice(None, None, 2))
+    q, shift = residual[stride], (slope * vertical_flow)[stride]
+    weight = mask[stride] / (1 + q * q / (_FREEDOM * noise))
     # A prior of zero lag with the weight of 0.1 px of motion: without motion the lag is unknown.
-    little = 0.01 * float((weight * slope[some] ** 2).sum()) + 1e-9
-    return float((weight * along * q).sum()) / (float((weight * along * along).sum()) + little)
+    ridge = 0.01 * float((weight * slope[stride] ** 2).sum()) + 1e-9
+    return float((weight * shift * q).sum()) / (float((weight * shift * shift).sum()) + ridge)
 
 
 @vectorised
 def gather(
-    now: Map, rest: Map, lefts: Map, less: Map, mask: Map, change: Map, noise: Map, cell: int, sums: Floats
+    now: Map,
+    rest: Map,
+    left_sum: Map,
+    target: Map,
+    mask: Map,
+    change: Map,
+    noise: Map,
+    cell: int,
+    sums: Floats,
 ) -> None:
     """Normal equations of one linearisation, summed over cells.
 
@@ -256,21 +268,23 @@ def gather(
         for x in range(2, width - 2):
             if mask[y, x] == 0:
                 continue
-            square, steep, along = np.float32(0), np.float32(0), np.float32(0)
+            square, slope_product, gradient = np.float32(0), np.float32(0), np.float32(0)
             for k in range(3):
-                q = now[k, y, x] - less[k, y, x]
-                near = now[k, y, x + 1] + rest[k, y, x + 1] - now[k, y, x - 1] - rest[k, y, x - 1]
-                far = now[k, y, x + 2] + rest[k, y, x + 2] - now[k, y, x - 2] - rest[k, y, x - 2]
-                right = (_EIGHT * near - far) * _TWELFTH * _HALF
-                near = lefts[k, y, x + 1] - lefts[k, y, x - 1]
-                left = (_EIGHT * near - (lefts[k, y, x + 2] - lefts[k, y, x - 2])) * _TWELFTH * _HALF
+                q = now[k, y, x] - target[k, y, x]
+                inner = now[k, y, x + 1] + rest[k, y, x + 1] - now[k, y, x - 1] - rest[k, y, x - 1]
+                outer = now[k, y, x + 2] + rest[k, y, x + 2] - now[k, y, x - 2] - rest[k, y, x - 2]
+                right_slope = (_EIGHT * inner - outer) * _TWELFTH * _HALF
+                inner = left_sum[k, y, x + 1] - left_sum[k, y, x - 1]
+                left_slope = (
+                    (_EIGHT * inner - (left_sum[k, y, x + 2] - left_sum[k, y, x - 2])) * _TWELFTH * _HALF
+                )
                 square += weight[k] * q * q
                 # A square would be biased by the noise of a slope; the product of two slopes is not.
-                steep += weight[k] * left * right
-                along += weight[k] * _HALF * (left + right) * q
-            robust = (_FREEDOM + _CHANNELS) / (_FREEDOM + square)
+                slope_product += weight[k] * left_slope * right_slope
+                gradient += weight[k] * _HALF * (left_slope + right_slope) * q
+            robust_weight = (_FREEDOM + _CHANNELS) / (_FREEDOM + square)
             i, j = y // cell, x // cell
-            sums[0, i, j] += robust * steep
-            sums[1, i, j] += robust * (along + steep * change[y, x])
+            sums[0, i, j] += robust_weight * slope_product
+            sums[1, i, j] += robust_weight * (gradient + slope_product * change[y, x])
             sums[2, i, j] += square / _CHANNELS
             sums[3, i, j] += _ONE

@@ -18,11 +18,11 @@ from synth.flow.image import flags
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
-_LEAST_TISSUE = 0.05  # share of the picture, below which its mask is in doubt
+_MIN_TISSUE = 0.05  # share of the picture, below which its mask is in doubt
 _BLOCK = 5  # px, side of the matched blocks; the penalties are those that OpenCV suggests for it
-_ALIKE = 0.5  # least local correlation of a match; chosen by hand
-_ENOUGH = 0.05  # share of the tissue that must match; chosen by hand
-_TRUSTED_PX = 1.5  # largest plausible change by the refinement; chosen by hand
+_MIN_CORRELATION = 0.5  # least local correlation of a match; chosen by hand
+_MIN_MATCHED = 0.05  # share of the tissue that must match; chosen by hand
+_MAX_REFINEMENT_PX = 1.5  # largest plausible change by the refinement; chosen by hand
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Rest:
     """Rest disparity on rectified left pixels."""
 
     disparity: Map  # (H, W) px: left column minus right column; finite everywhere
-    found: Mask  # (H, W), False where it was filled from the surroundings
+    matched: Mask  # (H, W), False where it was filled from the surroundings
     epipolar_px: float  # median distance of matches from their row: calibration error; NaN: not refined
 
 
@@ -40,7 +40,7 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
     `left_usable`, `right_usable`: (H, W), unmasked tissue, and unmasked pixels of the right picture;
     `refine`: to subpixels. UserError: too little matches within an eighth of the width to both sides.
     """
-    left, right = (np.atleast_3d(one.T).T.mean(axis=0, dtype=np.float32) for one in (left, right))
+    left, right = (np.atleast_3d(picture.T).T.mean(axis=0, dtype=np.float32) for picture in (left, right))
     width = left.shape[1]
     low, high = -width // 8, width // 8
     count = max(1, -(-(high - low + 1) // _STEP)) * _STEP
@@ -57,35 +57,35 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
     )
     # Padding lets pixels near the left and right borders match too.
     pad = count + abs(low)
-    levels = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (left, right))
-    padded = [cv2.copyMakeBorder(one, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for one in levels]
-    raw = matcher.compute(*padded)[:, pad:-pad].astype(np.float32) / 16
-    found = (raw >= low) & left_usable
-    why, share = f"at disparities from {low} to {high} px", float(left_usable.mean())
-    if share < _LEAST_TISSUE:
-        why += f" on the tissue, which is {100 * share:.2g}% of the picture: is tissue.png right?"
-    unmatched = UserError(f"stereo: the left and right rest pictures do not match {why}")
-    if not found.any():
-        raise unmatched
+    levels = (np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in (left, right))
+    padded = [cv2.copyMakeBorder(level, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for level in levels]
+    disparity = matcher.compute(*padded)[:, pad:-pad].astype(np.float32) / 16
+    matched = (disparity >= low) & left_usable
+    details, share = f"at disparities from {low} to {high} px", float(left_usable.mean())
+    if share < _MIN_TISSUE:
+        details += f" on the tissue, which is {100 * share:.2g}% of the picture: is tissue.png right?"
+    error = UserError(f"stereo: the left and right rest pictures do not match {details}")
+    if not matched.any():
+        raise error
     # From the nearest match.
-    filled = raw[tuple(distance_transform_edt(~found, return_distances=False, return_indices=True))]
+    filled = disparity[tuple(distance_transform_edt(~matched, return_distances=False, return_indices=True))]
     if not refine:
-        return Rest(filled, found, float("nan"))
-    flow, trust = _refined(left, right, left_usable, right_usable, filled)
-    better = (np.abs(-flow[0] - filled) < _TRUSTED_PX) & (trust > 0)
-    sure = better & found & (trust > _ALIKE)
-    if sure.sum() < _ENOUGH * left_usable.sum():
-        raise unmatched
-    off = float(np.median(np.abs(flow[1][sure])))
-    return Rest(np.where(better, -flow[0], filled).astype(np.float32), found, off)
+        return Rest(filled, matched, float("nan"))
+    flow, trust = _refine(left, right, left_usable, right_usable, filled)
+    refined = (np.abs(-flow[0] - filled) < _MAX_REFINEMENT_PX) & (trust > 0)
+    reliable = refined & matched & (trust > _MIN_CORRELATION)
+    if reliable.sum() < _MIN_MATCHED * left_usable.sum():
+        raise error
+    row_error_px = float(np.median(np.abs(flow[1][reliable])))
+    return Rest(np.where(refined, -flow[0], filled).astype(np.float32), matched, row_error_px)
 
 
-def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start: Map) -> tuple[Map, Map]:
+def _refine(left: Map, right: Map, left_usable: Mask, right_usable: Mask, disparity: Map) -> tuple[Map, Map]:
     """Flow (2, H, W) px from the left to the right rest picture, and its agreement (H, W)."""
-    initial = np.stack([-start, np.zeros_like(start)])
+    initial = np.stack([-disparity, np.zeros_like(disparity)])
     pictures = np.ascontiguousarray(left), np.ascontiguousarray(right)
     usable = flags(left_usable), flags(right_usable)
     # A disparity isn't the flow of a frame before: it is smoothed as a whole.
     settings = TVL1Settings(large_px=np.inf)
-    flow, trust, _ = Tvl1(settings, corrected=False).uncorrected(*pictures, *usable, initial)
+    flow, trust, _ = Tvl1(settings, corrected=False).estimate_uncorrected(*pictures, *usable, initial)
     return flow, trust

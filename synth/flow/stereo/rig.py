@@ -48,21 +48,23 @@ class Rectified:
 
     def __init__(self, rig: StereoRig) -> None:
         """Raises UserError if the right camera of the rig is not to the right of the left one."""
-        self.size, turns = rig.size, _turns(rig)
+        self.size, rotations = rig.size, _find_rotations(rig)
         # Position of the rotated right camera relative to the rotated left one.
-        across = turns[1] @ rig.translation
-        if across[0] >= 0 or abs(across[0]) < 0.9 * rig.baseline_mm:
-            raise UserError(f"stereo: the right camera is not to the right of the left one ({across} mm)")
-        self.baseline_mm = float(-across[0])
+        baseline = rotations[1] @ rig.translation
+        if baseline[0] >= 0 or abs(baseline[0]) < 0.9 * rig.baseline_mm:
+            raise UserError(f"stereo: the right camera is not to the right of the left one ({baseline} mm)")
+        self.baseline_mm = float(-baseline[0])
         self.focal = float(rig.left.K[0, 0])
-        cameras = tuple(zip((rig.left, rig.right), turns, strict=True))
-        self.K_left, K_right = (_middle(camera, turn, rig.size, self.focal) for camera, turn in cameras)
+        cameras = tuple(zip((rig.left, rig.right), rotations, strict=True))
+        self.K_left, K_right = (
+            _centre_camera(camera, rotation, rig.size, self.focal) for camera, rotation in cameras
+        )
         K_right[1, 2] = self.K_left[1, 2]
         self.shift = float(K_right[0, 2] - self.K_left[0, 2])
-        self._views = tuple((*one, K) for one, K in zip(cameras, (self.K_left, K_right), strict=True))
+        self._views = tuple((*pose, K) for pose, K in zip(cameras, (self.K_left, K_right), strict=True))
         self._maps = tuple(
-            cv2.initUndistortRectifyMap(camera.K, camera.distortion, turn, K, rig.size, cv2.CV_32FC1)
-            for camera, turn, K in self._views
+            cv2.initUndistortRectifyMap(camera.K, camera.distortion, rotation, K, rig.size, cv2.CV_32FC1)
+            for camera, rotation, K in self._views
         )
 
     def picture(self, grey: Map, camera: int) -> Map:
@@ -79,12 +81,14 @@ class Rectified:
         """Rectifies a flow (H, W, 2) px of the left camera: (2, H, W) px."""
         x, y = self._maps[0]
         u, v = (cv2.remap(np.ascontiguousarray(flow[..., k]), x, y, cv2.INTER_LINEAR) for k in range(2))
-        (along, down), (along_here, down_here) = self._offsets
-        there = x + u, y + v, cv2.INTER_LINEAR
-        ahead = (cv2.remap(part, *there, borderMode=cv2.BORDER_REPLICATE) for part in (along, down))
-        return np.stack([u + next(ahead) - along_here, v + next(ahead) - down_here])
+        (offset_x, offset_y), (rest_offset_x, rest_offset_y) = self._offsets
+        sampling = x + u, y + v, cv2.INTER_LINEAR
+        offsets = (
+            cv2.remap(part, *sampling, borderMode=cv2.BORDER_REPLICATE) for part in (offset_x, offset_y)
+        )
+        return np.stack([u + next(offsets) - rest_offset_x, v + next(offsets) - rest_offset_y])
 
-    def back(self, field: Map, camera: int = 0) -> Map:
+    def unrectify(self, field: Map, camera: int = 0) -> Map:
         """Resamples a field (H, W) from rectified pixels to those of the camera's own picture."""
         x, y = self._inverse[camera]
         return np.asarray(cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
@@ -102,30 +106,34 @@ class Rectified:
         y = np.arange(height, dtype=np.float32)[:, None] - np.float32(self.K_left[1, 2])
         rise = after - before
         # The difference of the two positions, written as a sum of small terms to avoid cancellation.
-        found = np.stack([flow[0] * after + x * rise, flow[1] * after + y * rise, self.focal * rise], axis=-1)
-        return (found / self.focal @ self._views[0][1]).astype(np.float32)
+        scaled_motion = np.stack(
+            [flow[0] * after + x * rise, flow[1] * after + y * rise, self.focal * rise], axis=-1
+        )
+        return (scaled_motion / self.focal @ self._views[0][1]).astype(np.float32)
 
     @cached_property
     def _inverse(self) -> tuple[tuple[Map, Map], ...]:
         """Rectified positions x, y, each (H, W), of the pixels of each camera."""
         width, height = self.size
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
-        found = []
-        for camera, turn, K in self._views:
-            there = cv2.undistortPoints(grid.reshape(-1, 1, 2), camera.K, camera.distortion, R=turn, P=K)
-            found.append(tuple(there[:, 0].T.reshape(2, height, width).astype(np.float32)))
-        return tuple(found)
+        maps = []
+        for camera, rotation, K in self._views:
+            positions = cv2.undistortPoints(
+                grid.reshape(-1, 1, 2), camera.K, camera.distortion, R=rotation, P=K
+            )
+            maps.append(tuple(positions[:, 0].T.reshape(2, height, width).astype(np.float32)))
+        return tuple(maps)
 
     @cached_property
     def _offsets(self) -> tuple[list[Map], list[Map]]:
         """Rectified minus original position of left pixels (x, y), and the same at rectified pixels."""
         width, height = self.size
         grid = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-        offset = [part - own for part, own in zip(self._inverse[0], grid, strict=True)]
-        return offset, [cv2.remap(part, *self._maps[0], cv2.INTER_LINEAR) for part in offset]
+        offset = [plane - position for plane, position in zip(self._inverse[0], grid, strict=True)]
+        return offset, [cv2.remap(plane, *self._maps[0], cv2.INTER_LINEAR) for plane in offset]
 
 
-def _turns(rig: StereoRig) -> tuple[Floats, Floats]:
+def _find_rotations(rig: StereoRig) -> tuple[Floats, Floats]:
     """Rotations from the axes of the left and right camera to the rectified axes (Bouguet, as in OpenCV)."""
     parallel = np.abs(rig.rotation - np.eye(3)).max() < _PARALLEL
     if parallel and np.abs(rig.translation[1:]).max() < _PARALLEL:
@@ -138,9 +146,9 @@ def _turns(rig: StereoRig) -> tuple[Floats, Floats]:
     return np.asarray(left, np.float64), np.asarray(right, np.float64)
 
 
-def _middle(camera: Intrinsics, turn: Floats, size: tuple[int, int], focal: float) -> Floats:
+def _centre_camera(camera: Intrinsics, rotation: Floats, size: tuple[int, int], focal: float) -> Floats:
     """K of a rectified camera that leaves the middle of the picture in place."""
     middle = (np.array(size, np.float64) - 1) / 2
-    ray = cv2.undistortPoints(middle[None, None], camera.K, camera.distortion, R=turn)[0, 0]
+    ray = cv2.undistortPoints(middle[None, None], camera.K, camera.distortion, R=rotation)[0, 0]
     x, y = middle - focal * ray
     return np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])

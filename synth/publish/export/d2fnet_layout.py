@@ -50,7 +50,7 @@ def _arrays(sequence: Sequence, count: int) -> dict[str, Any]:
     places = np.stack([columns, rows], axis=-1) + flow
     sizes = (np.linalg.norm(sequence["traction"][t], axis=-1) for t in frames)
     shares = [size[rows, columns] / (size.max() or 1) * force[t] / 1000 for t, size in enumerate(sizes)]
-    found = {
+    arrays = {
         "disp2d": (scale * flow).astype(np.float32),
         "force_mag": np.stack(shares).astype(np.float32),
         "projected_pixels": (shrink * places).astype(np.float32),
@@ -59,8 +59,8 @@ def _arrays(sequence: Sequence, count: int) -> dict[str, Any]:
     if "depth" in sequence:
         x, y = places.astype(np.float32).transpose(2, 0, 1)[..., None].copy()  # (T, N, 1) each
         depth = [cv2.remap(sequence["depth"][t], x[t], y[t], cv2.INTER_NEAREST)[:, 0] for t in frames]
-        found["depth"] = np.stack(depth)
-    return found
+        arrays["depth"] = np.stack(depth)
+    return arrays
 
 
 _NOTE = """\

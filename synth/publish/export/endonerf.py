@@ -50,15 +50,15 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
     for sequence in dataset:
         if "depth" not in sequence:
             raise UserError(f"{sequence.path}: has no depth; remove it from the job's store.without")
-        here = target / f"{sequence.index:06d}"
+        folder = target / f"{sequence.index:06d}"
         left = optics.camera_of(sequence)
         focal = float(left.K[0, 0])
-        bounds = _write_pictures(sequence, _maps(left, focal), here)
+        bounds = _write_pictures(sequence, _maps(left, focal), folder)
         lens, views = np.array([[*sequence.size, focal]]).T, optics.camera_poses(sequence)
-        each = (_pose(views[0] @ np.linalg.inv(view)) for view in views)  # to the camera of frame 0
-        poses = [np.concatenate([pose, lens], axis=1).ravel() for pose in each]
-        np.save(here / "poses_bounds.npy", np.concatenate([poses, bounds], axis=1))
-        about: dict[str, Any] = {
+        transforms = (_pose(views[0] @ np.linalg.inv(view)) for view in views)  # to the camera of frame 0
+        poses = [np.concatenate([pose, lens], axis=1).ravel() for pose in transforms]
+        np.save(folder / "poses_bounds.npy", np.concatenate([poses, bounds], axis=1))
+        metadata: dict[str, Any] = {
             "unit_mm": UNIT_MM,
             "focal_px": focal,
             "fps": sequence.attrs["fps"],
@@ -69,19 +69,19 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             right = stereo_checks.right_of(sequence)
             maps = _maps(right, focal, between(left, right)[0].T)
             for t in range(sequence.frames):
-                write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
-            about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
-        (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
+                write_png(folder / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
+            metadata["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
+        (folder / "scene.json").write_text(json.dumps(metadata, indent=1), "utf-8")
 
 
 def _maps(view: Camera, focal: float, turn: Floats = np.eye(3)) -> _Maps:
     """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume, turned."""
-    middle = np.array([[focal, 0, view.size[0] // 2], [0, focal, view.size[1] // 2], [0, 0, 1]], np.float64)
-    x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, turn, middle, view.size, cv2.CV_32FC1)
+    K = np.array([[focal, 0, view.size[0] // 2], [0, focal, view.size[1] // 2], [0, 0, 1]], np.float64)
+    x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, turn, K, view.size, cv2.CV_32FC1)
     return _Maps(np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 
-def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
+def _write_pictures(sequence: Sequence, maps: _Maps, folder: Path) -> Floats:
     """Images, depth and masks; returns nearest and farthest depth by frame, (T, 2)."""
     bounds = []
     for t in range(sequence.frames):
@@ -89,15 +89,15 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
         if depth.max() > np.iinfo(np.uint16).max:
             raise UserError(f"{sequence.path}: depth exceeds 16 bits at {UNIT_MM:g} mm")
         covered = maps.nearest(sequence["tool"][t].astype(np.uint8), outside=1).astype(bool) | (depth == 0)
-        write_png(here / "images" / f"{t:06d}.png", maps.smooth(sequence["rgb"][t]))
-        write_png(here / "depth" / f"{t:06d}.png", depth.astype(np.uint16))
-        write_png(here / "masks" / f"{t:06d}.png", covered)
-        free = depth[~covered]
-        bounds.append([free.min(), free.max()] if free.size else [0.0, 0.0])
+        write_png(folder / "images" / f"{t:06d}.png", maps.smooth(sequence["rgb"][t]))
+        write_png(folder / "depth" / f"{t:06d}.png", depth.astype(np.uint16))
+        write_png(folder / "masks" / f"{t:06d}.png", covered)
+        depths = depth[~covered]
+        bounds.append([depths.min(), depths.max()] if depths.size else [0.0, 0.0])
     return np.array(bounds)
 
 
 def _pose(pose: Floats) -> Floats:
     """A transform (4, 4) in mm and OpenCV axes as (3, 4) in axes right, up, backward and the scene's unit."""
-    turned = _TO_OPENGL @ pose[:3, :3] @ _TO_OPENGL
-    return np.concatenate([turned, (_TO_OPENGL @ pose[:3, 3:]) / UNIT_MM], axis=1)
+    rotation = _TO_OPENGL @ pose[:3, :3] @ _TO_OPENGL
+    return np.concatenate([rotation, (_TO_OPENGL @ pose[:3, 3:]) / UNIT_MM], axis=1)

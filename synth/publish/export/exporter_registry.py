@@ -8,7 +8,7 @@ from typing import Any
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry
 
-_OWN = {
+_BUILTIN = {
     "folder": "plain:write_folder",
     "hf": "hugging_face:write_parquet",
     "webdataset": "webdataset:write_shards",
@@ -19,7 +19,7 @@ _OWN = {
     "d2fnet-npz": "d2fnet_layout:write_npz",
     "vtu": "vtu:write_meshes",
 }
-_PLACES = {name: f"synth.publish.export.{place}" for name, place in _OWN.items()}
+_PLACES = {name: f"synth.publish.export.{place}" for name, place in _BUILTIN.items()}
 _PLACES["video"] = "synth.publish.sequence_video:write_videos"
 
 EXPORTERS = Registry("sulcus.exporters", "--to", "format", _PLACES)
@@ -43,13 +43,15 @@ def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
     if to not in EXPORTERS.names():
         raise UserError(f"{to}: is not one of {', '.join(EXPORTERS.names())}")
     write, dataset = EXPORTERS.load_as_is(to), Dataset(root)
-    with checked_file.folder_of(target) as part:
-        if to in EXPORTERS.own:
-            write(dataset, part, **options)
+    with checked_file.folder_of(target) as folder:
+        if to in EXPORTERS.builtin:
+            write(dataset, folder, **options)
         else:
             with as_user_error(EXPORTERS.label(to)):
-                write(dataset, part, **options)
-        on = {dataset[k].index: side for side, those in group_by_side(dataset).items() for k in those}
-        lines = [f"{number:06d},{on[number]}\n" for number in sorted(on)]
-        (part / "split.csv").write_text("sequence,split\n" + "".join(lines), "utf-8")
+                write(dataset, folder, **options)
+        side_of = {
+            dataset[k].index: side for side, positions in group_by_side(dataset).items() for k in positions
+        }
+        lines = [f"{number:06d},{side_of[number]}\n" for number in sorted(side_of)]
+        (folder / "split.csv").write_text("sequence,split\n" + "".join(lines), "utf-8")
     return len(dataset)

@@ -50,16 +50,16 @@ def write_pairs(dataset: Dataset, target: Path) -> None:
     for side, positions in group_by_side(dataset).items():
         for sequence in (dataset[position] for position in positions):
             pictures = [as_png(picture) for picture in sequence["rgb"][:]]
-            for kind, each in (("rest", _from_rest(sequence)), ("flow_next", _to_next(sequence))):
+            for kind, pairs in (("rest", _from_rest(sequence)), ("flow_next", _to_next(sequence))):
                 sintel, kitti = (target / kind / name for name in ("Sintel", "KittiFlow"))
-                for pair in each:
-                    scene, at = f"{sequence.index:06d}", pair.first + 1
+                for pair in pairs:
+                    scene, frame_number = f"{sequence.index:06d}", pair.first + 1
                     if kind == "rest":  # a scene of two frames: loaders pair neighbours
-                        scene, at = f"{sequence.index:06d}_{pair.second:04d}", 1
-                    both = pictures[pair.first], pictures[pair.second]
-                    _write_sintel(sintel / _TREES[side][0], scene, at, both, pair)
-                    _write_kitti(kitti / _TREES[side][1], f"{numbers[kind]:06d}", both, pair)
-                    row = kind, side, scene, f"frame_{at:04d}.flo", numbers[kind], sequence.index
+                        scene, frame_number = f"{sequence.index:06d}_{pair.second:04d}", 1
+                    pair_pictures = pictures[pair.first], pictures[pair.second]
+                    _write_sintel(sintel / _TREES[side][0], scene, frame_number, pair_pictures, pair)
+                    _write_kitti(kitti / _TREES[side][1], f"{numbers[kind]:06d}", pair_pictures, pair)
+                    row = kind, side, scene, f"frame_{frame_number:04d}.flo", numbers[kind], sequence.index
                     lines.append(",".join(map(str, (*row, pair.first, pair.second))))
                     numbers[kind] += 1
     (target / "pairs.csv").write_text("\n".join(lines) + "\n", "utf-8")
@@ -76,51 +76,53 @@ def _from_rest(sequence: Sequence) -> Iterator[_Pair]:
 
 def _to_next(sequence: Sequence) -> Iterator[_Pair]:
     """Each frame with the next one; none of a sequence without flow between them."""
-    everything = "flow_next_all" in sequence
-    if not everything and "flow_next" not in sequence:
+    has_all = "flow_next_all" in sequence
+    if not has_all and "flow_next" not in sequence:
         return
     tissue = sequence["tissue"][:] > 0
     for t in range(sequence.frames - 1):
-        flow = sequence["flow_next_all" if everything else "flow_next"][t].astype(np.float32)
-        motion, seen = sequence["flow"][t], tissue & (sequence["visible"][t] > 0)
-        shown = carry_forward(seen, motion) & ~(sequence["tool"][t] > 0)
-        lost = carry_forward(seen & ~(sequence["visible"][t + 1] > 0), motion) & shown
-        height, width = shown.shape
+        flow = sequence["flow_next_all" if has_all else "flow_next"][t].astype(np.float32)
+        motion, seen_tissue = sequence["flow"][t], tissue & (sequence["visible"][t] > 0)
+        carried = carry_forward(seen_tissue, motion) & ~(sequence["tool"][t] > 0)
+        hidden = carry_forward(seen_tissue & ~(sequence["visible"][t + 1] > 0), motion) & carried
+        height, width = carried.shape
         x, y = np.arange(width) + flow[..., 0], np.arange(height)[:, None] + flow[..., 1]
         inside = (x > -0.5) & (y > -0.5) & (x < width - 0.5) & (y < height - 0.5)
-        valid = sequence["depth"][t] > 0 if everything and "depth" in sequence else shown
-        yield _Pair(t, t + 1, flow, np.asarray(valid, bool), np.asarray(inside & ~lost, bool))
+        valid = sequence["depth"][t] > 0 if has_all and "depth" in sequence else carried
+        yield _Pair(t, t + 1, flow, np.asarray(valid, bool), np.asarray(inside & ~hidden, bool))
 
 
 def carry_forward(rest: Mask, flow: Map) -> Mask:
     """A mask (H, W) of rest pixels in the frame to which the flow (H, W, 2) px leads, small gaps closed."""
     height, width = rest.shape
     rows, columns = np.nonzero(rest)
-    x, y = (np.rint(one).astype(int) for one in (columns + flow[rest, 0], rows + flow[rest, 1]))
+    x, y = (np.rint(positions).astype(int) for positions in (columns + flow[rest, 0], rows + flow[rest, 1]))
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    found = np.zeros((height, width), np.uint8)
-    found[y[inside], x[inside]] = 1
-    edged = cv2.copyMakeBorder(found, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.morphologyEx(edged, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))[2:-2, 2:-2], bool)
+    mask = np.zeros((height, width), np.uint8)
+    mask[y[inside], x[inside]] = 1
+    padded = cv2.copyMakeBorder(mask, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))[2:-2, 2:-2], bool)
 
 
-def _write_sintel(root: Path, scene: str, at: int, both: tuple[bytes, bytes], pair: _Pair) -> None:
+def _write_sintel(
+    root: Path, scene: str, frame_number: int, pictures: tuple[bytes, bytes], pair: _Pair
+) -> None:
     for kind in ("clean", "flow", "occlusions", "invalid"):
         (root / kind / scene).mkdir(parents=True, exist_ok=True)
-    for k, data in enumerate(both):
-        (root / "clean" / scene / f"frame_{at + k:04d}.png").write_bytes(data)
+    for k, data in enumerate(pictures):
+        (root / "clean" / scene / f"frame_{frame_number + k:04d}.png").write_bytes(data)
     head = b"PIEH" + np.array(pair.flow.shape[1::-1], "<i4").tobytes()  # Middlebury's format
     values = np.where(pair.valid[..., None], pair.flow, _UNKNOWN).astype("<f4").tobytes()
-    name = f"frame_{at:04d}"
+    name = f"frame_{frame_number:04d}"
     (root / "flow" / scene / f"{name}.flo").write_bytes(head + values)
     (root / "occlusions" / scene / f"{name}.png").write_bytes(as_png(pair.valid & ~pair.visible))
     (root / "invalid" / scene / f"{name}.png").write_bytes(as_png(~pair.valid))
 
 
-def _write_kitti(root: Path, name: str, both: tuple[bytes, bytes], pair: _Pair) -> None:
+def _write_kitti(root: Path, name: str, pictures: tuple[bytes, bytes], pair: _Pair) -> None:
     for kind in ("image_2", "flow_occ", "flow_noc"):
         (root / kind).mkdir(parents=True, exist_ok=True)
-    for k, data in enumerate(both):
+    for k, data in enumerate(pictures):
         (root / "image_2" / f"{name}_{10 + k}.png").write_bytes(data)
     for kind, valid in (("flow_occ", pair.valid), ("flow_noc", pair.valid & pair.visible)):
         (root / kind / f"{name}_10.png").write_bytes(_as_kitti(pair.flow, valid))

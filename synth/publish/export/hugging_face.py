@@ -46,11 +46,11 @@ class ParquetColumn:
         kind = str(self.feature["_type"])
         if not kind.startswith("Array"):
             return pa.field(self.name, self.type)
-        about = {
+        metadata = {
             "ARROW:extension:name": f"datasets.features.features.{kind}ExtensionType",
             "ARROW:extension:metadata": json.dumps([self.feature["shape"], self.feature["dtype"]]),
         }
-        return pa.field(self.name, self.type, metadata=about)
+        return pa.field(self.name, self.type, metadata=metadata)
 
     def pack(self, values: list[Any]) -> pa.Array:
         """Rows as that type, without a Python object for each number of an array."""
@@ -71,17 +71,22 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     first, sides = dataset[0], index.group_by_side(dataset)
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
     frameless = [name for name in first.fields if name not in framed]
-    about = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
-    frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
-    each = [_plain(column.name, str(column.type).replace("double", "float64")) for column in about]
-    each += [*(_field(first, name) for name in frameless), _plain("attributes", "string")]
+    index_columns = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
+    frame_columns = [
+        *(_plain(name, kind) for name, (kind, _) in _ROWS.items()),
+        *(_field(first, n) for n in framed),
+    ]
+    sequence_columns = [
+        _plain(column.name, str(column.type).replace("double", "float64")) for column in index_columns
+    ]
+    sequence_columns += [*(_field(first, name) for name in frameless), _plain("attributes", "string")]
     # Of the sequences that are written: the stored index may be missing, or older.
-    rows = [index.row_of(one) for one in dataset]
+    rows = [index.row_of(sequence) for sequence in dataset]
     for side, positions in sides.items():
-        shown = (row for k in positions for row in _frames(dataset[k], framed))
-        _write(target / "frames", side, frames, shown)
-        whole = (rows[k] | _frameless(dataset[k], frameless) for k in positions)
-        _write(target / "sequences", side, each, whole)
+        frame_rows = (row for k in positions for row in _frames(dataset[k], framed))
+        _write(target / "frames", side, frame_columns, frame_rows)
+        sequence_rows = (rows[k] | _frameless(dataset[k], frameless) for k in positions)
+        _write(target / "sequences", side, sequence_columns, sequence_rows)
         for k in positions:
             rows[k]["split"] = side
     text = card.template("export/hugging_face.md.jinja").render(
@@ -90,7 +95,7 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
         row_columns=_ROWS,
         framed=[FIELDS[name] for name in framed],
         still=[FIELDS[name] for name in frameless],
-        index=about,
+        index=index_columns,
     )
     (target / "README.md").write_text(text, "utf-8")
 
@@ -137,8 +142,8 @@ def _cell(name: str, values: Array) -> Any:
 def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator[dict[str, Any]]) -> None:
     """Writes `SIDE-NNNNN.parquet` in `folder`, each of several row groups."""
     features = {column.name: column.feature for column in columns}
-    about = {"huggingface": json.dumps({"info": {"features": features}})}
-    schema = pa.schema([column.describe() for column in columns], about)
+    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+    schema = pa.schema([column.describe() for column in columns], metadata)
     folder.mkdir(exist_ok=True)
     first = next(rows)
     size = sum(_bytes(first[column.name]) for column in columns)
@@ -148,8 +153,8 @@ def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator
         path = folder / f"{side}-{part:05d}.parquet"
         packing = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
         with pq.ParquetWriter(path, schema, **packing) as writer:
-            for some in chain([group], islice(groups, _GROUPS - 1)):
-                packed = [column.pack([row[column.name] for row in some]) for column in columns]
+            for batch in chain([group], islice(groups, _GROUPS - 1)):
+                packed = [column.pack([row[column.name] for row in batch]) for column in columns]
                 writer.write_table(pa.Table.from_arrays(packed, schema=schema))
 
 

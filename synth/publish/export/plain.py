@@ -19,16 +19,16 @@ def write_folder(dataset: Dataset, target: Path) -> None:
     The right camera's pictures are in `NNNNNN/rgb_right/`, linear light in `NNNNNN/radiance/TTTT.exr`.
     """
     for sequence in dataset:
-        here = target / f"{sequence.index:06d}"
-        here.mkdir()
+        folder = target / f"{sequence.index:06d}"
+        folder.mkdir()
         for name in sequence.fields:
             if name not in (*PICTURES, "radiance"):
-                np.save(here / f"{name}.npy", sequence[name][:])
+                np.save(folder / f"{name}.npy", sequence[name][:])
                 continue
             for t in range(sequence.frames):
                 write, ending = (write_png, "png") if name in PICTURES else (write_exr, "exr")
-                write(here / name / f"{t:04d}.{ending}", sequence[name][t])
-        (here / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
+                write(folder / name / f"{t:04d}.{ending}", sequence[name][t])
+        (folder / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
 
 
 def write_hdf5(dataset: Dataset, target: Path) -> None:
@@ -44,5 +44,5 @@ def write_hdf5(dataset: Dataset, target: Path) -> None:
                 values = sequence[name][:]
                 chunks = (1, *values.shape[1:]) if FIELDS[name].framed else None
                 packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if chunks else {}
-                made = file.create_dataset(name, data=values, chunks=chunks, **packing)
-                made.attrs["unit"], made.attrs["meaning"] = FIELDS[name].unit, FIELDS[name].meaning
+                field = file.create_dataset(name, data=values, chunks=chunks, **packing)
+                field.attrs["unit"], field.attrs["meaning"] = FIELDS[name].unit, FIELDS[name].meaning

@@ -55,11 +55,11 @@ def write_tracks(dataset: Dataset, target: Path) -> None:
 
 def _choose(sequence: Sequence) -> Ints:
     """Pixels (N, 2) as x, y: a square grid of up to `_POINTS` on tissue visible in frame 0."""
-    shown = sequence["tissue"][:] & sequence["visible"][0]
-    step = max(1, int(np.ceil(np.sqrt(shown.sum() / _POINTS))))
-    grid = np.zeros_like(shown)
+    visible = sequence["tissue"][:] & sequence["visible"][0]
+    step = max(1, int(np.ceil(np.sqrt(visible.sum() / _POINTS))))
+    grid = np.zeros_like(visible)
     grid[step // 2 :: step, step // 2 :: step] = True
-    pixels = np.argwhere(shown & grid)[:, ::-1]
+    pixels = np.argwhere(visible & grid)[:, ::-1]
     if not len(pixels):
         raise UserError(f"{sequence.path}: shows no tissue in frame 0")
     return pixels
@@ -70,8 +70,8 @@ def _in_depth(sequence: Sequence, pixels: Ints) -> dict[str, Array]:
     view, right = optics.camera_of(sequence), stereo_checks.right_of(sequence)
     (fx, _, cx), (_, fy, cy), _ = view.K
     columns, rows = pixels.T
-    along = rays(view, pixels.astype(np.float64))
-    rest = along * depth_of(view, right, along, sequence["disparity"][:][rows, columns])[:, None]
+    directions = rays(view, pixels.astype(np.float64))
+    rest = directions * depth_of(view, right, directions, sequence["disparity"][:][rows, columns])[:, None]
     tracks = np.stack([rest + sequence["motion"][t][rows, columns] for t in range(sequence.frames)])
     return {
         "tracks_XYZ": (tracks / 1000).astype(np.float32),

@@ -33,19 +33,23 @@ def write_meshes(dataset: Dataset, target: Path) -> None:
     """
     job = Folder(dataset.root).job()
     name_of_job = identity.identify_job(job)  # once: it reads every file of a series
-    ours = FemMechanics(inside=True) if job.mechanics.source is None else None
+    mechanics = FemMechanics(inside=True) if job.mechanics.source is None else None
     for sequence in dataset:
-        scene, name = simulate(job, sequence.index, mechanics=ours), f"{sequence.index:06d}"
-        known, now = sequence["force"][:] if "force" in sequence else scene.force, scene.force
-        same = known.shape == now.shape and np.allclose(known, now, _ROUNDING, 1e-6, equal_nan=True)
-        if not same or sequence.attrs["job"] != name_of_job:
+        scene, name = simulate(job, sequence.index, mechanics=mechanics), f"{sequence.index:06d}"
+        stored_force, force = sequence["force"][:] if "force" in sequence else scene.force, scene.force
+        unchanged = stored_force.shape == force.shape and np.allclose(
+            stored_force, force, _ROUNDING, 1e-6, equal_nan=True
+        )
+        if not unchanged or sequence.attrs["job"] != name_of_job:
             raise UserError(f"{sequence.path}: can't be simulated again from the dataset's job")
-        outside = ((*scene.shape, TRIANGLE, _fields(scene, t)) for t in range(len(scene)))
-        _write(target, name, scene.time, outside)
-        if (under := scene.motion.volume) is not None:
-            each = zip(under.displacement, under.stress, strict=True)
-            inside = ((under.points, under.cells, _TET, {"displacement": u, "stress": s}) for u, s in each)
-            _write(target, f"{name}-volume", scene.time, inside)
+        surface_meshes = ((*scene.shape, TRIANGLE, _fields(scene, t)) for t in range(len(scene)))
+        _write(target, name, scene.time, surface_meshes)
+        if (volume := scene.motion.volume) is not None:
+            states = zip(volume.displacement, volume.stress, strict=True)
+            volume_meshes = (
+                (volume.points, volume.cells, _TET, {"displacement": u, "stress": s}) for u, s in states
+            )
+            _write(target, f"{name}-volume", scene.time, volume_meshes)
 
 
 def _write(
@@ -63,12 +67,12 @@ def _write(
 
 def _fields(scene: Scene, t: int) -> dict[str, Floats]:
     """Fields (V, n) of frame t at the surface's vertices."""
-    motion, rest, now = scene.motion, scene.shape.vertices, scene.state(t)
-    moved = camera.project(now.camera or scene.view, now.vertices) - camera.project(scene.view, rest)
-    found = {"displacement": motion.displacement[t], "flow": np.pad(moved, ((0, 0), (0, 1)))}
+    motion, rest, state = scene.motion, scene.shape.vertices, scene.state(t)
+    flow = camera.project(state.camera or scene.view, state.vertices) - camera.project(scene.view, rest)
+    fields = {"displacement": motion.displacement[t], "flow": np.pad(flow, ((0, 0), (0, 1)))}
     if not np.isnan(scene.force).any():
-        found |= {"traction": motion.traction[t], "force": scene.vertex_area[:, None] * motion.traction[t]}
-    return found
+        fields |= {"traction": motion.traction[t], "force": scene.vertex_area[:, None] * motion.traction[t]}
+    return fields
 
 
 def vtu(points: Floats, cells: Array, kind: int, fields: Mapping[str, Floats]) -> str:
@@ -76,10 +80,10 @@ def vtu(points: Floats, cells: Array, kind: int, fields: Mapping[str, Floats]) -
 
     def array(name: str, dtype: str, values: Array) -> str:
         data = np.ascontiguousarray(values, np.dtype(dtype.lower()).newbyteorder("<")).tobytes()
-        coded = base64.b64encode(np.array(len(data), "<u8").tobytes() + data).decode()
-        parts = values.shape[1] if values.ndim == 2 else 1
-        about = f'type="{dtype}" Name="{name}" NumberOfComponents="{parts}" format="binary"'
-        return f"<DataArray {about}>{coded}</DataArray>\n"
+        encoded = base64.b64encode(np.array(len(data), "<u8").tobytes() + data).decode()
+        components = values.shape[1] if values.ndim == 2 else 1
+        attributes = f'type="{dtype}" Name="{name}" NumberOfComponents="{components}" format="binary"'
+        return f"<DataArray {attributes}>{encoded}</DataArray>\n"
 
     count, nodes = cells.shape
     parts = [
@@ -91,6 +95,6 @@ def vtu(points: Floats, cells: Array, kind: int, fields: Mapping[str, Floats]) -
         '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
         f'<UnstructuredGrid><Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">\n'
         f"<Points>{array('points', 'Float64', points)}</Points>\n<Cells>{''.join(parts)}</Cells>\n"
-        f"<PointData>{''.join(array(name, 'Float32', one) for name, one in fields.items())}</PointData>\n"
+        f"<PointData>{''.join(array(name, 'Float32', data) for name, data in fields.items())}</PointData>\n"
         "</Piece></UnstructuredGrid></VTKFile>\n"
     )

@@ -36,10 +36,10 @@ class Chart:
 def places(chart: Chart, pixels: int) -> Floats:
     """World x, y (pixels^2, 2) mm of the pixels of a map on a chart, row by row."""
     axis = noise.centres(pixels, chart.extent_mm)
-    laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
-    xy = laid
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
+    xy = grid
     for _ in range(_TURNS if chart.shift.any() else 0):  # a contraction, below a stretch of 2.3
-        xy = xy + 0.6 * (laid - chart.at(xy))
+        xy = xy + 0.6 * (grid - chart.at(xy))
     return xy
 
 
@@ -65,19 +65,21 @@ def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float)
     options.max_cost, options.normal_deviation_weight = 1e9, 0.0  # one piece, however bent
     atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
     atlas.generate(chart_options=options)
-    which, corners, flat = atlas[0]
+    vertex_map, corners, uv = atlas[0]
     if atlas.chart_count != 1:
         return Chart(shift, plan_mm, plan_mm)
     # Turned and moved onto the projection, and scaled to the surface's area: as complex numbers.
-    laid = flat.astype(np.float64) @ [atlas.width, 1j * atlas.height]
-    below = plan[which] @ [1, 1j]
-    turn = np.vdot(laid - laid.mean(), below - below.mean())
-    size = np.sqrt(_area(vertices[which][corners]) / _area(np.stack([laid.real, laid.imag], -1)[corners]))
-    moved = below.mean() + size * turn / np.abs(turn) * (laid - laid.mean()) - below
-    unknown = np.ones((_COARSE, _COARSE), bool)
-    unknown.flat[which] = False
-    shift.reshape(-1, 2)[which] = np.stack([moved.real, moved.imag], axis=-1)
-    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    layout = uv.astype(np.float64) @ [atlas.width, 1j * atlas.height]
+    projection = plan[vertex_map] @ [1, 1j]
+    turn = np.vdot(layout - layout.mean(), projection - projection.mean())
+    scale = np.sqrt(
+        _area(vertices[vertex_map][corners]) / _area(np.stack([layout.real, layout.imag], -1)[corners])
+    )
+    offset = projection.mean() + scale * turn / np.abs(turn) * (layout - layout.mean()) - projection
+    unmapped = np.ones((_COARSE, _COARSE), bool)
+    unmapped.flat[vertex_map] = False
+    shift.reshape(-1, 2)[vertex_map] = np.stack([offset.real, offset.imag], axis=-1)
+    nearest = distance_transform_edt(unmapped, return_distances=False, return_indices=True)
     return Chart(shift[tuple(nearest)], plan_mm, plan_mm + 2 * float(np.abs(shift).max()))
 
 

@@ -28,7 +28,7 @@ class Growth:
 
     spacing: float  # of the points that need supply
     reach: float  # distance from which a point pulls
-    near: float  # distance of a vessel that satisfies a point
+    kill_distance: float  # distance of a vessel that satisfies a point
     step: float
     straight: float  # weight of a branch's heading, as a multiple of the pull
     end: tuple[float, float]  # radius of the finest
@@ -37,24 +37,33 @@ class Growth:
 def fill(tree: Tree, targets: Floats, growth: Growth, rng: np.random.Generator) -> Tree:
     """The tree with branches grown to targets (N, 2) mm; a vessel's r^3 is the sum of its branches'."""
     count = len(tree.nodes)
-    room = max(_MOST, 2 * count)
-    nodes, parent = np.zeros((room, 2)), np.full(room, -1)
+    capacity = max(_MOST, 2 * count)
+    nodes, parent = np.zeros((capacity, 2)), np.full(capacity, -1)
     nodes[:count], parent[:count] = tree.nodes, tree.parent
-    heading = np.zeros((room, 2))
-    along = tree.parent >= 0
-    heading[:count][along] = tree.nodes[along] - tree.nodes[tree.parent[along]]
+    heading = np.zeros((capacity, 2))
+    has_parent = tree.parent >= 0
+    heading[:count][has_parent] = tree.nodes[has_parent] - tree.nodes[tree.parent[has_parent]]
     heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-12)
     targets = np.ascontiguousarray(targets)
-    stray = _PUSHED * rng.standard_normal((room, 2))
-    used = _grow(
-        nodes, parent, heading, count, targets, stray, growth.reach, growth.near, growth.step, growth.straight
+    stray = _PUSHED * rng.standard_normal((capacity, 2))
+    total = _grow(
+        nodes,
+        parent,
+        heading,
+        count,
+        targets,
+        stray,
+        growth.reach,
+        growth.kill_distance,
+        growth.step,
+        growth.straight,
     )
-    nodes, parent = nodes[:used], parent[:used]
-    cubes = np.zeros(used)
-    ends = np.flatnonzero(np.bincount(parent + 1, minlength=used + 1)[1:] == 0)
+    nodes, parent = nodes[:total], parent[:total]
+    cubes = np.zeros(total)
+    ends = np.flatnonzero(np.bincount(parent + 1, minlength=total + 1)[1:] == 0)
     ends = ends[ends >= count]
     cubes[ends] = rng.uniform(*growth.end, len(ends)) ** 3
-    radius = np.cbrt(gather(parent, cubes) + np.append(tree.radius, np.zeros(used - count)) ** 3)
+    radius = np.cbrt(gather(parent, cubes) + np.append(tree.radius, np.zeros(total - count)) ** 3)
     return Tree(nodes, parent, radius)
 
 
@@ -68,12 +77,12 @@ def _grow(
     targets: Floats,
     stray: Floats,
     reach: float,
-    near: float,
+    kill_mm: float,
     step: float,
     straight: float,
 ) -> int:
     """Adds nodes to the first `count` of `nodes` (M, 2), with parents and headings; returns their number."""
-    most = len(nodes)
+    limit = len(nodes)
     total = len(targets)
     if total == 0 or count == 0:
         return count
@@ -90,49 +99,49 @@ def _grow(
     order = np.argsort(cell)
     distance = np.full(total, reach)
     nearest = np.full(total, -1, np.int64)
-    pull = np.zeros((most, 2))
-    child = np.full(most, -1, np.int64)
-    fresh, wave = 0, 0
-    while fresh < count and count < most:
-        for k in range(fresh, count):
+    pull = np.zeros((limit, 2))
+    child = np.full(limit, -1, np.int64)
+    wave_start, wave_end = 0, 0
+    while wave_start < count and count < limit:
+        for k in range(wave_start, count):
             u, v = int(np.floor((nodes[k, 0] - left) / reach)), int(np.floor((nodes[k, 1] - low) / reach))
             for row in range(max(0, v - 1), min(rows, v + 2)):
                 for column in range(max(0, u - 1), min(columns, u + 2)):
                     c = row * columns + column
                     for j in range(first[c], first[c + 1]):
                         i = order[j]
-                        away = np.hypot(targets[i, 0] - nodes[k, 0], targets[i, 1] - nodes[k, 1])
-                        if away < distance[i]:
-                            distance[i], nearest[i] = away, k
-        wave = count
+                        separation = np.hypot(targets[i, 0] - nodes[k, 0], targets[i, 1] - nodes[k, 1])
+                        if separation < distance[i]:
+                            distance[i], nearest[i] = separation, k
+        wave_end = count
         for i in range(total):
             k = nearest[i]
-            if k >= 0 and distance[i] > near:
+            if k >= 0 and distance[i] > kill_mm:
                 pull[k, 0] += (targets[i, 0] - nodes[k, 0]) / distance[i]
                 pull[k, 1] += (targets[i, 1] - nodes[k, 1]) / distance[i]
         for i in range(total):
             k = nearest[i]
-            if k < 0 or distance[i] <= near or (pull[k, 0] == 0.0 and pull[k, 1] == 0.0) or count >= most:
+            if k < 0 or distance[i] <= kill_mm or (pull[k, 0] == 0.0 and pull[k, 1] == 0.0) or count >= limit:
                 continue
-            size = np.hypot(pull[k, 0], pull[k, 1]) + 1e-9
-            keep = straight if k >= 0 and child[k] < 0 else 0.0
-            x = pull[k, 0] / size + keep * heading[k, 0] + stray[count, 0]
-            y = pull[k, 1] / size + keep * heading[k, 1] + stray[count, 1]
+            norm = np.hypot(pull[k, 0], pull[k, 1]) + 1e-9
+            inertia = straight if k >= 0 and child[k] < 0 else 0.0
+            x = pull[k, 0] / norm + inertia * heading[k, 0] + stray[count, 0]
+            y = pull[k, 1] / norm + inertia * heading[k, 1] + stray[count, 1]
             pull[k, 0], pull[k, 1] = 0.0, 0.0
-            size = np.hypot(x, y) + 1e-9
-            x, y = x / size, y / size
-            ahead, aside = heading[k, 0], heading[k, 1]
-            if child[k] >= 0 and ahead * ahead + aside * aside > 0.5 and x * ahead + y * aside < _FORWARD[0]:
-                turn = _FORWARD[1] if ahead * y - aside * x > 0 else -_FORWARD[1]
-                x, y = _FORWARD[0] * ahead - turn * aside, _FORWARD[0] * aside + turn * ahead
-            at_x, at_y = nodes[k, 0] + step * x, nodes[k, 1] + step * y
+            norm = np.hypot(x, y) + 1e-9
+            x, y = x / norm, y / norm
+            hx, hy = heading[k, 0], heading[k, 1]
+            if child[k] >= 0 and hx * hx + hy * hy > 0.5 and x * hx + y * hy < _FORWARD[0]:
+                turn = _FORWARD[1] if hx * y - hy * x > 0 else -_FORWARD[1]
+                x, y = _FORWARD[0] * hx - turn * hy, _FORWARD[0] * hy + turn * hx
+            new_x, new_y = nodes[k, 0] + step * x, nodes[k, 1] + step * y
             c = child[k]
-            if c >= 0 and np.hypot(nodes[c, 0] - at_x, nodes[c, 1] - at_y) < _NEAR * step:
+            if c >= 0 and np.hypot(nodes[c, 0] - new_x, nodes[c, 1] - new_y) < _NEAR * step:
                 nearest[i] = -1  # left to a vessel that comes nearer
                 continue
-            nodes[count, 0], nodes[count, 1], parent[count] = at_x, at_y, k
+            nodes[count, 0], nodes[count, 1], parent[count] = new_x, new_y, k
             heading[count, 0], heading[count, 1] = x, y
             child[k] = count
             count += 1
-        fresh = wave
+        wave_start = wave_end
     return count

@@ -15,17 +15,17 @@ def step(x: Array) -> Map:
     return np.asarray(t * t * (3 - 2 * t), np.float32)
 
 
-def ridge(x: Array, width: float, at: float = 0.0) -> Array:
-    """A Gaussian ridge of `x` (...): 1 at `at`, 1/e at a distance of `width`."""
-    return np.asarray(np.exp(-(((x - at) / width) ** 2)))
+def ridge(x: Array, width: float, centre: float = 0.0) -> Array:
+    """A Gaussian ridge of `x` (...): 1 at `centre`, 1/e at a distance of `width`."""
+    return np.asarray(np.exp(-(((x - centre) / width) ** 2)))
 
 
-def speckled(colour: Rgb, *contrasts: Array) -> Array:
+def speckle(colour: Rgb, *contrasts: Array) -> Array:
     """A colour (r, n, 3), linear RGB, that varies by the sum of `contrasts` (r, n), as shares of it."""
     return np.asarray(np.asarray(colour, np.float32) * np.asarray(sum(contrasts, 1))[..., None])
 
 
-def through(colour: Array, depth: Array, absorption: Rgb) -> Array:
+def attenuate(colour: Array, depth: Array, absorption: Rgb) -> Array:
     """Colours (r, n, 3) under a layer (Beer-Lambert) of optical depth `depth` (r, n) times `absorption`."""
     if not depth.any():  # of most rows, by most layers
         return colour

@@ -21,13 +21,13 @@ def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm:
     """Isotropic noise (pixels, pixels) float32 about one wavelength, in a band of half width `width` as a
     share of its centre frequency; zero mean, unit variance."""
     frequency = _frequencies(pixels, extent_mm)
-    return _filtered(rng, np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2))
+    return _filter_noise(rng, np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2))
 
 
 def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm: float, slope: float) -> Map:
     """Noise (n, n) of amplitude ~ 1/f^slope for waves below `longest_mm`; zero mean, unit variance."""
     frequency = _frequencies(pixels, extent_mm)
-    return _filtered(rng, (frequency**2 + longest_mm**-2) ** (-0.5 * slope))
+    return _filter_noise(rng, (frequency**2 + longest_mm**-2) ** (-0.5 * slope))
 
 
 def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
@@ -36,32 +36,34 @@ def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
     # Wide kernels are slow; a small picture loses no detail of a widely blurred one.
     if sigma > 12:
         side = max(32, int(image.shape[0] * 6 / sigma))
-        small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
-        small = cv2.GaussianBlur(small, (0, 0), sigma * side / image.shape[0], borderType=cv2.BORDER_REFLECT)
-        return np.asarray(cv2.resize(small, image.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+        reduced = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
+        reduced = cv2.GaussianBlur(
+            reduced, (0, 0), sigma * side / image.shape[0], borderType=cv2.BORDER_REFLECT
+        )
+        return np.asarray(cv2.resize(reduced, image.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-def in_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...]:
+def map_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...]:
     """Applies a pixelwise `paint` to maps (n, ...) a few rows at a time: faster, same bytes."""
     starts = range(0, len(maps[0]), _ROWS)
     parts = [paint(*(image[start : start + _ROWS] for image in maps)) for start in starts]
     return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
-def in_part(
-    paint: Callable[..., tuple[Map, ...]], where: Indices, rest: tuple[float, ...], *maps: Map
+def map_pixels(
+    paint: Callable[..., tuple[Map, ...]], indices: Indices, fill: tuple[float, ...], *maps: Map
 ) -> tuple[Map, ...]:
-    """As `in_rows`, of the pixels (M,) `where` alone, counted row by row; others are filled with `rest`."""
+    """As `map_rows`, of the pixels `indices` (M,) alone, counted row by row; others take `fill`."""
     flat = [image.reshape(-1, *image.shape[2:]) for image in maps]
-    painted = list[Map]()
-    for start in range(0, len(where), _CHUNK):
-        part = where[start : start + _CHUNK]
-        for k, values in enumerate(paint(*(image[part][None] for image in flat))):
-            if k == len(painted):
-                painted.append(np.full((len(flat[0]), *values.shape[2:]), rest[k], np.float32))
-            painted[k][part] = values[0]
-    return tuple(values.reshape(*maps[0].shape[:2], *values.shape[1:]) for values in painted)
+    outputs = list[Map]()
+    for start in range(0, len(indices), _CHUNK):
+        chunk = indices[start : start + _CHUNK]
+        for k, values in enumerate(paint(*(image[chunk][None] for image in flat))):
+            if k == len(outputs):
+                outputs.append(np.full((len(flat[0]), *values.shape[2:]), fill[k], np.float32))
+            outputs[k][chunk] = values[0]
+    return tuple(values.reshape(*maps[0].shape[:2], *values.shape[1:]) for values in outputs)
 
 
 def sample(image: Map, xy: Floats, extent_mm: float) -> Map:
@@ -70,8 +72,8 @@ def sample(image: Map, xy: Floats, extent_mm: float) -> Map:
     width = 32_000  # cv2.remap takes pictures no longer than a short integer
     padding = -len(pixel) % width or width * (len(pixel) == 0)  # nor of no rows
     grid = np.pad(pixel, ((0, padding), (0, 0))).reshape(-1, width, 2)
-    read = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(read, np.float32).reshape(-1, *image.shape[2:])[: len(pixel)]
+    values = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32).reshape(-1, *image.shape[2:])[: len(pixel)]
 
 
 def centres(pixels: int, extent_mm: float) -> Map:
@@ -85,11 +87,11 @@ def _frequencies(pixels: int, extent_mm: float) -> Floats:
     return np.asarray(np.hypot(np.fft.fftfreq(pixels, step)[:, None], np.fft.rfftfreq(pixels, step)[None]))
 
 
-def _filtered(rng: np.random.Generator, gain: Floats) -> Map:
+def _filter_noise(rng: np.random.Generator, gain: Floats) -> Map:
     pixels = len(gain)
-    white = rng.standard_normal((pixels, pixels), dtype=np.float32)
-    spectrum = np.fft.rfft2(white)
+    white_noise = rng.standard_normal((pixels, pixels), dtype=np.float32)
+    spectrum = np.fft.rfft2(white_noise)
     gain[0, 0] = 0.0
     spectrum *= gain.astype(np.float32)
-    noise = np.fft.irfft2(spectrum, s=(pixels, pixels))
-    return np.asarray((noise - noise.mean()) / noise.std(), np.float32)
+    filtered = np.fft.irfft2(spectrum, s=(pixels, pixels))
+    return np.asarray((filtered - filtered.mean()) / filtered.std(), np.float32)

@@ -77,43 +77,43 @@ def grow(
     if brain is None:
         sulci = _folds(relief, extent)
     else:
-        outer, sulci = _under_opening(brain, relief, extent)
-    tree = vessels.grow_all(sulci, extent, np.random.default_rng([relief.seed, 1]))
+        arachnoid, sulci = _cover_brain(brain, relief, extent)
+    network = vessels.grow_all(sulci, extent, np.random.default_rng([relief.seed, 1]))
     if brain is None:
-        sulci = np.maximum(sulci, _beds(tree.veins, extent))
+        sulci = np.maximum(sulci, _beds(network.veins, extent))
 
-    def height(at: Floats) -> Floats:
+    def height(points: Floats) -> Floats:
         if brain is not None:
-            return noise.sample(outer, at, extent).astype(np.float64)
-        dome = np.sqrt(np.maximum(dome_mm**2 - (at**2).sum(axis=1), 0)) - dome_mm
-        return np.asarray(dome - relief.sulcus_mm * noise.sample(sulci, at, extent))
+            return noise.sample(arachnoid, points, extent).astype(np.float64)
+        dome = np.sqrt(np.maximum(dome_mm**2 - (points**2).sum(axis=1), 0)) - dome_mm
+        return np.asarray(dome - relief.sulcus_mm * noise.sample(sulci, points, extent))
 
     pia = height(xy)
     chart = unroll(height, extent, opening_mm + MARGIN_MM / 2)
-    tree = vessels.Vessels(*(replace(one, nodes=chart.at(one.nodes)) for one in vars(tree).values()))
-    laid = chart.at(xy)
-    z = pia + veined * noise.sample(bulge(tree, chart.extent_mm), laid, chart.extent_mm)
+    network = vessels.Vessels(*(replace(tree, nodes=chart.at(tree.nodes)) for tree in vars(network).values()))
+    chart_xy = chart.at(xy)
+    z = pia + veined * noise.sample(bulge(network, chart.extent_mm), chart_xy, chart.extent_mm)
     return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=grid_faces(side, side).reshape(-1, 3),
         pia=pia.reshape(side, side),
-        uv=(laid / chart.extent_mm + 0.5).astype(np.float32),
+        uv=(chart_xy / chart.extent_mm + 0.5).astype(np.float32),
         extent_mm=extent,
         chart=chart,
         sulci=noise.sample(sulci, places(chart, _RELIEF_PX), extent).reshape(_RELIEF_PX, _RELIEF_PX),
-        vessels=tree,
+        vessels=network,
         seed=relief.seed,
     )
 
 
-def bulge(grown: Vessels, extent_mm: float) -> Map:
+def bulge(network: Vessels, extent_mm: float) -> Map:
     """Height of veins above the pia, (n, n) mm: half sunk round tubes with soft shoulders, pressed in where
     arteries cross them."""
-    distance, radius = tube.raster(grown.veins, _RELIEF_PX, extent_mm, 0.1)
-    inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    distance, radius = tube.raster(grown.trunks, _RELIEF_PX, extent_mm, 0.1)
-    pressed = _DIP * np.clip(radius / 0.25, 0, 1) * (distance < radius + 0.1)
-    return noise.blur((inside * (1 - pressed)).astype(np.float32), 0.2, extent_mm)
+    distance, radius = tube.raster(network.veins, _RELIEF_PX, extent_mm, 0.1)
+    height = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
+    distance, radius = tube.raster(network.trunks, _RELIEF_PX, extent_mm, 0.1)
+    dent = _DIP * np.clip(radius / 0.25, 0, 1) * (distance < radius + 0.1)
+    return noise.blur((height * (1 - dent)).astype(np.float32), 0.2, extent_mm)
 
 
 def _folds(relief: Relief, extent_mm: float) -> Map:
@@ -123,10 +123,10 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
     waves = noise.band(rng, _RELIEF_PX, extent_mm, 2 * relief.gyrus_mm, 0.22)
     waves = waves + 0.12 * noise.band(rng, _RELIEF_PX, extent_mm, 0.7 * relief.gyrus_mm, 0.3)
     # For a sine of that wavelength both have the same amplitude: |sin| is a row of cushions between clefts.
-    away = np.abs(waves)
+    amplitude = np.abs(waves)
     slope = np.hypot(*np.gradient(waves, extent_mm / _RELIEF_PX)) * relief.gyrus_mm / np.pi
     slope = noise.blur(slope.astype(np.float32), 0.5, extent_mm)
-    valley = (1 - away / np.maximum(np.hypot(away, slope), 1e-3)) ** _ROUND
+    valley = (1 - amplitude / np.maximum(np.hypot(amplitude, slope), 1e-3)) ** _ROUND
     fade = np.clip(0.85 + 0.2 * noise.band(rng, _RELIEF_PX, extent_mm, 1.6 * relief.gyrus_mm, 0.3), 0.5, 1.0)
     return noise.blur((valley * fade).astype(np.float32), 0.4, extent_mm)
 
@@ -134,29 +134,29 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
 def _beds(veins: Tree, extent_mm: float) -> Map:
     """Grooves of wide veins where they cross a gyrus, (n, n) from 0 to 1 as the sulci."""
     distance, radius = tube.raster(veins, _RELIEF_PX // 4, extent_mm, 3.6)
-    bed = _BED * np.clip(radius / 0.8, 0, 1) * np.exp(-((distance / 1.8) ** 2))
-    bed = noise.blur(bed.astype(np.float32), 0.3, extent_mm)
-    return np.asarray(cv2.resize(bed, (_RELIEF_PX, _RELIEF_PX)), np.float32)
+    groove = _BED * np.clip(radius / 0.8, 0, 1) * np.exp(-((distance / 1.8) ** 2))
+    groove = noise.blur(groove.astype(np.float32), 0.3, extent_mm)
+    return np.asarray(cv2.resize(groove, (_RELIEF_PX, _RELIEF_PX)), np.float32)
 
 
-def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
+def _cover_brain(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
     """Height (n, n) mm of the arachnoid over a brain, and its sulci (n, n) from 0 to 1."""
     height = _height_map(brain, extent, _RELIEF_PX // 2)
-    hole = np.isnan(height)
-    if hole.mean() > 1 - LEAST_FILLED:
-        found = "`synth preview` of the mesh finds suitable places"
-        raise UserError(f"anatomy.craniotomy: the brain's surface does not fill the opening there; {found}")
-    if hole.any():  # the height of the nearest pixel
-        nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
+    gaps = np.isnan(height)
+    if gaps.mean() > 1 - LEAST_FILLED:
+        hint = "`synth preview` of the mesh finds suitable places"
+        raise UserError(f"anatomy.craniotomy: the brain's surface does not fill the opening there; {hint}")
+    if gaps.any():  # the height of the nearest pixel
+        nearest = distance_transform_edt(gaps, return_distances=False, return_indices=True)
         height = height[tuple(nearest)]
     # The arachnoid bridges narrow clefts: a closing, then a smoothing.
     pixel = extent / len(height)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
-    bridged = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
-    outer = noise.blur(np.maximum(height, bridged - relief.sulcus_mm), 0.7, extent)
-    depth = noise.blur(outer, 4.0, extent) - outer
+    closing = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
+    arachnoid = noise.blur(np.maximum(height, closing - relief.sulcus_mm), 0.7, extent)
+    depth = noise.blur(arachnoid, 4.0, extent) - arachnoid
     sulci = np.clip(depth / max(float(np.quantile(depth, 0.98)), 1e-6), 0, 1).astype(np.float32)
-    return outer, sulci
+    return arachnoid, sulci
 
 
 def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
@@ -167,11 +167,11 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
     corners = flat[faces]
     low = np.ceil(corners.min(axis=1)).astype(np.int64)
     high = np.floor(corners.max(axis=1)).astype(np.int64)
-    near = ((high >= 0) & (low < pixels) & (high >= low)).all(axis=1)
+    visible = ((high >= 0) & (low < pixels) & (high >= low)).all(axis=1)
     # Without the far side and the base of the brain, which lie deeper than any sulcus.
-    near &= vertices[faces][:, :, 2].max(axis=1) > -0.75 * extent
+    visible &= vertices[faces][:, :, 2].max(axis=1) > -0.75 * extent
     height = np.full((pixels, pixels), np.nan, np.float32)
-    for face in np.flatnonzero(near):
+    for face in np.flatnonzero(visible):
         (x0, y0), (x1, y1) = np.clip(low[face], 0, None), np.clip(high[face], None, pixels - 1)
         a, b, c = corners[face]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -55,7 +55,7 @@ def lattice(extent_mm: float, spacing_mm: float, rng: np.random.Generator) -> La
     return Lattice(points, joints, np.hypot(*(points[joints[1]] - points[joints[0]]).T))
 
 
-def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floats, sharing: float) -> Tree:
+def least_cost(grid: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floats, sharing: float) -> Tree:
     """The tree from roots to ends (indices of points) with vessels of `radius` (E,) mm at the ends.
 
     `cost`: (N,) of a mm at each point; `sharing`: by how much a wide vessel makes a way cheaper, per multiple
@@ -64,97 +64,103 @@ def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floa
     count = len(cost)
     cubes = np.zeros(count)
     cubes[ends] = radius**3
-    shared, finest = cost, radius.min()
+    shared_cost, finest = cost, radius.min()
     for _ in range(_ROUNDS):
-        weights = way.lengths * (shared[way.links[0]] + shared[way.links[1]])
-        graph = coo_array((weights, way.links), shape=(count, count)).tocsr()
-        found = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
-        distance, before = found[0], found[1].astype(np.int64)
+        weights = grid.lengths * (shared_cost[grid.links[0]] + shared_cost[grid.links[1]])
+        graph = coo_array((weights, grid.links), shape=(count, count)).tocsr()
+        paths = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
+        distance, predecessors = paths[0], paths[1].astype(np.int64)
         order = np.argsort(distance, kind="stable")
-        through = gather(before, cubes)
-        shared = cost / (1 + sharing * np.cbrt(through) / finest)
-    used = order[through[order] > 0]
+        flow = gather(predecessors, cubes)
+        shared_cost = cost / (1 + sharing * np.cbrt(flow) / finest)
+    nodes = order[flow[order] > 0]
     number = np.full(count + 1, -1)
-    number[used] = np.arange(len(used))
-    parent = number[np.where(before[used] >= 0, before[used], count)]
-    return Tree(way.points[used], parent, np.cbrt(through[used]))
+    number[nodes] = np.arange(len(nodes))
+    parent = number[np.where(predecessors[nodes] >= 0, predecessors[nodes], count)]
+    return Tree(grid.points[nodes], parent, np.cbrt(flow[nodes]))
 
 
-def gather(before: Ints, cubes: Floats) -> Floats:
-    """Sums (N,) of the cubes at a point and at all that come after it; `before`: negative at a root."""
+def gather(predecessors: Ints, cubes: Floats) -> Floats:
+    """Sums (N,) of the cubes at a point and at all that come after it; `predecessors`: negative at a root."""
     total, point = cubes.copy(), np.flatnonzero(cubes)
     amount = cubes[point]
     while len(point):  # all ends go up together, a point at a time
-        inner = before[point] >= 0
-        point, amount = before[point[inner]], amount[inner]
+        has_parent = predecessors[point] >= 0
+        point, amount = predecessors[point[has_parent]], amount[has_parent]
         np.add.at(total, point, amount)
     return total
 
 
-def halved(tree: Tree) -> Tree:
+def subdivide(tree: Tree) -> Tree:
     """The tree with a node more in the middle of each segment, and one more at each root."""
     nodes, count = tree.nodes, len(tree.nodes)
     root = tree.parent < 0
-    up = np.where(root, np.arange(count), tree.parent)
-    between = np.stack([0.5 * (nodes + nodes[up]), nodes], axis=1).reshape(-1, 2)
+    upstream = np.where(root, np.arange(count), tree.parent)
+    points = np.stack([0.5 * (nodes + nodes[upstream]), nodes], axis=1).reshape(-1, 2)
     parent = np.stack([np.where(root, -1, 2 * tree.parent + 1), 2 * np.arange(count)], axis=1).ravel()
-    return Tree(between, parent, np.repeat(tree.radius, 2))
+    return Tree(points, parent, np.repeat(tree.radius, 2))
 
 
-def relaxed(nodes: Floats, parent: Ints, radius: Floats, stiff: float, rounds: int) -> Floats:
+def relax(nodes: Floats, parent: Ints, radius: Floats, stiff: float, rounds: int) -> Floats:
     """Nodes (N, 2) mm drawn to their neighbours' mean by springs r^2.
 
     Vessels of radius `stiff` mm and wider move fully in each round, finer ones in proportion; ends stay.
     """
     count, child = len(nodes), np.flatnonzero(parent >= 0)
-    up, tension = parent[child], radius[child] ** 2
-    ends = np.concatenate([child, up]), np.concatenate([up, child])
+    upstream, tension = parent[child], radius[child] ** 2
+    ends = np.concatenate([child, upstream]), np.concatenate([upstream, child])
     springs: csr_array = coo_array((np.tile(tension, 2), ends), shape=(count, count)).tocsr()
     weight = springs.sum(axis=1)
-    free = (parent >= 0) & (np.bincount(up, minlength=count) > 0)
-    rate = np.where(free, 0.5 * np.minimum(1, radius / stiff) / np.where(free, weight, 1), 0)
-    move = (diags_array(rate) @ (springs - diags_array(weight))).tocsr()
+    movable = (parent >= 0) & (np.bincount(upstream, minlength=count) > 0)
+    rate = np.where(movable, 0.5 * np.minimum(1, radius / stiff) / np.where(movable, weight, 1), 0)
+    update = (diags_array(rate) @ (springs - diags_array(weight))).tocsr()
     for _ in range(rounds):
-        nodes = nodes + move @ nodes
+        nodes = nodes + update @ nodes
     return nodes
 
 
-def remaining(nodes: Floats, parent: Ints, beyond: Floats) -> Floats:
-    """Length (N,) mm from each node to the farthest end that it supplies, `beyond` (N,) mm longer there."""
-    left, length = beyond.copy(), np.hypot(*(nodes - nodes[parent]).T)
-    waiting = np.bincount(parent[parent >= 0], minlength=len(nodes))  # children that aren't done
-    done = np.flatnonzero(waiting == 0)
+def remaining_length(nodes: Floats, parent: Ints, extra_mm: Floats) -> Floats:
+    """Length (N,) mm from each node to the farthest end that it supplies, `extra_mm` (N,) mm longer there."""
+    remaining_mm, length = extra_mm.copy(), np.hypot(*(nodes - nodes[parent]).T)
+    pending = np.bincount(parent[parent >= 0], minlength=len(nodes))  # children that aren't done
+    done = np.flatnonzero(pending == 0)
     while len(done := done[parent[done] >= 0]):
-        up = parent[done]
-        np.maximum.at(left, up, left[done] + length[done])
-        np.subtract.at(waiting, up, 1)
-        up = np.unique(up)
-        done = up[waiting[up] == 0]
-    return left
+        upstream = parent[done]
+        np.maximum.at(remaining_mm, upstream, remaining_mm[done] + length[done])
+        np.subtract.at(pending, upstream, 1)
+        upstream = np.unique(upstream)
+        done = upstream[pending[upstream] == 0]
+    return remaining_mm
 
 
-def joined(tree: Tree, share: float, reach_mm: float, step_mm: float, rng: np.random.Generator) -> Tree:
+def anastomose(tree: Tree, share: float, reach_mm: float, step_mm: float, rng: np.random.Generator) -> Tree:
     """The tree with a share of its ends led on to the nearest other vessel within reach (anastomoses).
 
     The last node of each lies on that vessel.
     """
     ends = np.flatnonzero(np.bincount(tree.parent + 1, minlength=len(tree.parent) + 1)[1:] == 0)
     ends = ends[rng.random(len(ends)) < share]
-    away, near = cKDTree(tree.nodes).query(tree.nodes[ends], 24, distance_upper_bound=reach_mm)
+    all_distances, all_neighbours = cKDTree(tree.nodes).query(
+        tree.nodes[ends], 24, distance_upper_bound=reach_mm
+    )
     nodes, parent, radius = [tree.nodes], [tree.parent], [tree.radius]
-    up, count = tree.parent, len(tree.parent)
-    for end, distances, others in zip(ends, away, near, strict=True):
-        own, k = set[int](), int(end)
-        while k >= 0 and len(own) < 2 * reach_mm / step_mm:
-            own.add(k)
-            k = int(up[k])
-        met = [int(k) for k, d in zip(others, distances, strict=True) if np.isfinite(d)]
-        met = [k for k in met if k not in own and not own & {int(up[k]), int(up[up[k]])}]
-        if not met:
+    upstream, count = tree.parent, len(tree.parent)
+    for end, distances, neighbours in zip(ends, all_distances, all_neighbours, strict=True):
+        ancestors, k = set[int](), int(end)
+        while k >= 0 and len(ancestors) < 2 * reach_mm / step_mm:
+            ancestors.add(k)
+            k = int(upstream[k])
+        candidates = [int(k) for k, d in zip(neighbours, distances, strict=True) if np.isfinite(d)]
+        candidates = [
+            k
+            for k in candidates
+            if k not in ancestors and not ancestors & {int(upstream[k]), int(upstream[upstream[k]])}
+        ]
+        if not candidates:
             continue
-        way = tree.nodes[met[0]] - tree.nodes[end]
-        steps = max(2, round(float(np.linalg.norm(way)) / step_mm))
-        nodes.append(tree.nodes[end] + np.arange(1, steps + 1)[:, None] / steps * way)
+        offset = tree.nodes[candidates[0]] - tree.nodes[end]
+        steps = max(2, round(float(np.linalg.norm(offset)) / step_mm))
+        nodes.append(tree.nodes[end] + np.arange(1, steps + 1)[:, None] / steps * offset)
         parent.append(np.concatenate([[end], count + np.arange(steps - 1)]))
         radius.append(np.full(steps, tree.radius[end]))
         count += steps

@@ -24,28 +24,28 @@ def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float | Floats 
 @argument_types("f8[:,::1], i8[::1], f8[::1], f8, f8[::1], f4[:,::1], f4[:,::1]")
 @vectorised
 def _draw(
-    at: Floats, parent: Ints, wide: Floats, scale: float, margins: Floats, distance: Map, radius: Map
+    nodes: Floats, parent: Ints, radii: Floats, scale: float, margins: Floats, distance: Map, radius: Map
 ) -> None:
-    """Draws round segments into the two maps; `at` in texels, of which a mm has `scale`."""
+    """Draws round segments into the two maps; `nodes` in texels, of which a mm has `scale`."""
     rows, columns = distance.shape
     for k in range(len(parent)):
         p = parent[k]
         if p < 0:
             continue
         # A twig is not as wide as its trunk where it branches off.
-        first, last, margin = min(wide[p], 1.3 * wide[k]), wide[k], margins[k]
+        first, last, margin = min(radii[p], 1.3 * radii[k]), radii[k], margins[k]
         reach = (max(first, last) + margin) * scale
-        x0, y0, dx, dy = at[p, 0], at[p, 1], at[k, 0] - at[p, 0], at[k, 1] - at[p, 1]
-        whole = max(dx * dx + dy * dy, 1e-12)
+        x0, y0, dx, dy = nodes[p, 0], nodes[p, 1], nodes[k, 0] - nodes[p, 0], nodes[k, 1] - nodes[p, 1]
+        length2 = max(dx * dx + dy * dy, 1e-12)
         top, bottom = max(0, int(min(y0, y0 + dy) - reach)), min(rows, int(max(y0, y0 + dy) + reach) + 2)
         left, right = max(0, int(min(x0, x0 + dx) - reach)), min(columns, int(max(x0, x0 + dx) + reach) + 2)
         for y in range(top, bottom):
             for x in range(left, right):
-                part = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / whole))
-                aside, along = x - x0 - part * dx, y - y0 - part * dy
-                own = first + part * (last - first)
+                fraction = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / length2))
+                offset_x, offset_y = x - x0 - fraction * dx, y - y0 - fraction * dy
+                local_radius = first + fraction * (last - first)
                 # Nearer than its margin, and deeper than in the vessel before: most texels need no root.
-                most = scale * (own + min(margin, distance[y, x] - radius[y, x]))
-                square = aside * aside + along * along
-                if most > 0 and square < most * most:
-                    distance[y, x], radius[y, x] = np.sqrt(square) / scale, own
+                limit = scale * (local_radius + min(margin, distance[y, x] - radius[y, x]))
+                square = offset_x * offset_x + offset_y * offset_y
+                if limit > 0 and square < limit * limit:
+                    distance[y, x], radius[y, x] = np.sqrt(square) / scale, local_radius

@@ -19,13 +19,13 @@ from synth.render.anatomy.layers import over
 from synth.render.anatomy.tree import (
     Lattice,
     Tree,
+    anastomose,
     gather,
-    halved,
-    joined,
     lattice,
     least_cost,
-    relaxed,
-    remaining,
+    relax,
+    remaining_length,
+    subdivide,
 )
 
 _PATCH_MM = 34.0  # side of the patch that numbers of trunks are counted on
@@ -69,14 +69,14 @@ DEEP = Kind(
 
 
 TRIBUTARIES = (
-    Growth(spacing=6.0, reach=14.0, near=3.0, step=0.25, straight=1.5, end=(0.17, 0.32)),
-    Growth(spacing=3.0, reach=8.0, near=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
+    Growth(spacing=6.0, reach=14.0, kill_distance=3.0, step=0.25, straight=1.5, end=(0.17, 0.32)),
+    Growth(spacing=3.0, reach=8.0, kill_distance=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=3.2, reach=12.0, near=0.9, step=0.22, straight=3.0, end=(0.03, 0.04)),
-    Growth(spacing=1.5, reach=5.0, near=0.45, step=0.16, straight=2.4, end=(0.03, 0.036)),
-    Growth(spacing=0.88, reach=2.5, near=0.24, step=0.12, straight=2.2, end=(0.022, 0.030)),
-    Growth(spacing=0.5, reach=1.5, near=0.16, step=0.1, straight=1.8, end=(0.017, 0.027)),
+    Growth(spacing=3.2, reach=12.0, kill_distance=0.9, step=0.22, straight=3.0, end=(0.03, 0.04)),
+    Growth(spacing=1.5, reach=5.0, kill_distance=0.45, step=0.16, straight=2.4, end=(0.03, 0.036)),
+    Growth(spacing=0.88, reach=2.5, kill_distance=0.24, step=0.12, straight=2.2, end=(0.022, 0.030)),
+    Growth(spacing=0.5, reach=1.5, kill_distance=0.16, step=0.1, straight=1.8, end=(0.017, 0.027)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
@@ -108,59 +108,67 @@ class Vessels:
 
 def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     """Vessels of a square patch, along its sulci (n, n): 0 on a crown to 1 in a sulcus."""
-    everywhere = np.ones((8, 8), np.float32)
-    veins = _grown(VEINS, sulci, everywhere, extent_mm, rng)
+    uniform_density = np.ones((8, 8), np.float32)
+    veins = _grow(VEINS, sulci, uniform_density, extent_mm, rng)
     # The density of arteries varies between gyri, and is 0 on a wide vein.
-    rich = np.clip(0.8 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5), 0.15, 1.0)
+    artery_density = np.clip(0.8 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5), 0.15, 1.0)
     distance, width = tube.raster(veins, 128, extent_mm)
-    rich *= (distance > width + 0.3) | (width < 0.3)
-    trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
-    deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
-    smooth = _smooth(_pruned(veins, 0.05), 1.6)
-    visible = smooth
+    artery_density *= (distance > width + 0.3) | (width < 0.3)
+    trunks = _grow(ARTERIES, sulci, artery_density.astype(np.float32), extent_mm, rng)
+    deep = _grow(DEEP, sulci, uniform_density, extent_mm, rng)
+    smooth_veins = _smooth(_prune(veins, 0.05), 1.6)
+    visible_veins = smooth_veins
     for growth in TRIBUTARIES:
-        visible = colonisation.fill(visible, _targets(growth, everywhere, extent_mm, rng), growth, rng)
-    visible = _finished(visible, len(smooth.nodes), 0.0, extent_mm, rng)
-    distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
-    beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
-    free = (~beside * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)).astype(np.float32)
-    arteries = main = _slender(_smooth(_even(_from_outside(_pruned(trunks, _TRUNK_MM), extent_mm)), 1.3))
+        visible_veins = colonisation.fill(
+            visible_veins, _place_targets(growth, uniform_density, extent_mm, rng), growth, rng
+        )
+    visible_veins = _finish(visible_veins, len(smooth_veins.nodes), 0.0, extent_mm, rng)
+    distance, width = tube.raster(visible_veins, 512, extent_mm, _BESIDE_MM)
+    vein_margin = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
+    free_density = (
+        ~vein_margin * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)
+    ).astype(np.float32)
+    arteries = main_arteries = _thin_ends(
+        _smooth(_level_radii(_keep_entering(_prune(trunks, _TRUNK_MM), extent_mm)), 1.3)
+    )
     for growth in ARTERIOLES:
-        arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
-    arteries = _finished(_narrow(_without_thorns(arteries)), len(main.nodes), _BENT[0], extent_mm, rng)
-    return Vessels(veins, trunks, visible, arteries, deep)
+        arteries = colonisation.fill(
+            arteries, _place_targets(growth, free_density, extent_mm, rng), growth, rng
+        )
+    arteries = _finish(_narrow(_remove_thorns(arteries)), len(main_arteries.nodes), _BENT[0], extent_mm, rng)
+    return Vessels(veins, trunks, visible_veins, arteries, deep)
 
 
-def _targets(growth: Growth, density: Map, extent_mm: float, rng: np.random.Generator) -> Floats:
+def _place_targets(growth: Growth, density: Map, extent_mm: float, rng: np.random.Generator) -> Floats:
     """Points (N, 2) mm about a growth's spacing apart, of which a share `density` (m, m) stays."""
-    points = _jittered(growth.spacing, extent_mm, rng)
+    points = _jitter_grid(growth.spacing, extent_mm, rng)
     return points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
 
 
-def _pruned(tree: Tree, least_mm: float) -> Tree:
+def _prune(tree: Tree, least_mm: float) -> Tree:
     """The tree without twigs of a radius below `least_mm`."""
-    return _parts(tree, gather(tree.parent, (tree.radius >= least_mm).astype(np.float64)) > 0)
+    return _select(tree, gather(tree.parent, (tree.radius >= least_mm).astype(np.float64)) > 0)
 
 
-def _from_outside(tree: Tree, extent_mm: float) -> Tree:
+def _keep_entering(tree: Tree, extent_mm: float) -> Tree:
     """The trunks that enter at the patch's border, or all: a start in mid-field looks like a spindle."""
-    kept = ~_inside(tree, extent_mm)[_trunk_of(tree)]
-    return _parts(tree, kept) if kept.any() else tree
+    entering = ~_inside(tree, extent_mm)[_find_trunks(tree)]
+    return _select(tree, entering) if entering.any() else tree
 
 
-def _even(tree: Tree) -> Tree:
+def _level_radii(tree: Tree) -> Tree:
     """The tree no vessel of which widens away from its root, as beside a start in mid-field."""
-    wide = tree.radius.tolist()
-    for k, up in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
-        if up >= 0:
-            wide[up] = max(wide[up], wide[k])
-    return Tree(tree.nodes, tree.parent, np.array(wide))
+    radii = tree.radius.tolist()
+    for k, parent in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
+        if parent >= 0:
+            radii[parent] = max(radii[parent], radii[k])
+    return Tree(tree.nodes, tree.parent, np.array(radii))
 
 
-def _parts(tree: Tree, kept: Mask) -> Tree:
+def _select(tree: Tree, selection: Mask) -> Tree:
     """The tree of the nodes (N,) that are kept, which includes the parent of each."""
-    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-    return Tree(tree.nodes[kept], number[tree.parent[kept]], tree.radius[kept])
+    number = np.append(np.where(selection, np.cumsum(selection) - 1, -1), -1)
+    return Tree(tree.nodes[selection], number[tree.parent[selection]], tree.radius[selection])
 
 
 def _smooth(tree: Tree, over_mm: float) -> Tree:
@@ -170,15 +178,15 @@ def _smooth(tree: Tree, over_mm: float) -> Tree:
     """
     length = np.hypot(*(tree.nodes - tree.nodes[tree.parent])[tree.parent >= 0].T)
     rounds = round(2 * (over_mm / max(float(np.mean(length)), 0.02)) ** 2)
-    spread = np.column_stack([tree.nodes, np.log(tree.radius)])
-    spread = relaxed(spread, tree.parent, tree.radius**2, 1e-3, rounds)
-    return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
+    state = np.column_stack([tree.nodes, np.log(tree.radius)])
+    state = relax(state, tree.parent, tree.radius**2, 1e-3, rounds)
+    return Tree(state[:, :2], tree.parent, np.exp(state[:, 2]))
 
 
-def _slender(tree: Tree) -> Tree:
+def _thin_ends(tree: Tree) -> Tree:
     """The tree thinned towards its ends, where finer branches go on."""
-    left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
-    return Tree(tree.nodes, tree.parent, tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5)
+    remaining_mm = remaining_length(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
+    return Tree(tree.nodes, tree.parent, tree.radius * np.clip(remaining_mm / _THIN_MM, 0.25, 1) ** 0.5)
 
 
 def _narrow(tree: Tree) -> Tree:
@@ -186,18 +194,18 @@ def _narrow(tree: Tree) -> Tree:
     return Tree(tree.nodes, tree.parent, tree.radius / (1 + (tree.radius / _WIDEST_MM) ** 4) ** 0.25)
 
 
-def _without_thorns(tree: Tree) -> Tree:
+def _remove_thorns(tree: Tree) -> Tree:
     """The tree without side branches that are short, most of all beside the trunk that they leave."""
-    left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
-    left = left + np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
+    remaining_mm = remaining_length(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
+    remaining_mm = remaining_mm + np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
     least = _TWIG_MM + _TWIG_RADII * tree.radius[tree.parent]
-    longest = np.zeros(len(left))
+    longest = np.zeros(len(remaining_mm))
     child = np.flatnonzero(tree.parent >= 0)
-    np.maximum.at(longest, tree.parent[child], left[child])
-    gone = (tree.parent >= 0) & (left < least) & (left < longest[tree.parent])
-    while (beyond := gone[tree.parent] & (tree.parent >= 0) & ~gone).any():
-        gone |= beyond
-    return _parts(tree, ~gone)
+    np.maximum.at(longest, tree.parent[child], remaining_mm[child])
+    thorns = (tree.parent >= 0) & (remaining_mm < least) & (remaining_mm < longest[tree.parent])
+    while (outer := thorns[tree.parent] & (tree.parent >= 0) & ~thorns).any():
+        thorns |= outer
+    return _select(tree, ~thorns)
 
 
 def _inside(tree: Tree, extent_mm: float) -> Mask:
@@ -205,47 +213,56 @@ def _inside(tree: Tree, extent_mm: float) -> Mask:
     return np.asarray(np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)
 
 
-def _finished(tree: Tree, main: int, bent: float, extent_mm: float, rng: np.random.Generator) -> Tree:
+def _finish(tree: Tree, main: int, bend_mm: float, extent_mm: float, rng: np.random.Generator) -> Tree:
     """The tree whose nodes from number `main` on have grown in, made to wind and bend, and thinned."""
-    nodes = relaxed(tree.nodes, tree.parent, tree.radius**2, 1e-3, _ROUNDED)
+    nodes = relax(tree.nodes, tree.parent, tree.radius**2, 1e-3, _ROUNDED)
     shift, wave = _WINDING
     winding, bends = (
         np.stack([noise.sample(noise.band(rng, 256, extent_mm, w, 0.5), nodes, extent_mm) for _ in "xy"], 1)
         for w in (wave, _BENT[1])
     )
-    supple = shift / (1 + (tree.radius / _SUPPLE_MM) ** 2)
-    left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
-    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.5, 1) ** 0.5)
+    suppleness = shift / (1 + (tree.radius / _SUPPLE_MM) ** 2)
+    remaining_mm = remaining_length(nodes, tree.parent, np.zeros(len(nodes)))
+    thinning = np.where(np.arange(len(nodes)) < main, 1, np.clip(remaining_mm / _TAPER_MM, 0.5, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
-    short, long = (
+    short_waves, long_waves = (
         noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 9.0)
     )
-    wide = np.clip(tree.radius / 0.3, 0, 1)
-    radius = tree.radius * thinned * np.clip(1 + over(0.12 * short, 0.2 * long, wide), 0.75, 1.3)
-    return _pointed(Tree(nodes + supple[:, None] * winding + bent * bends, tree.parent, radius), extent_mm)
+    wide_share = np.clip(tree.radius / 0.3, 0, 1)
+    radius = (
+        tree.radius
+        * thinning
+        * np.clip(1 + over(0.12 * short_waves, 0.2 * long_waves, wide_share), 0.75, 1.3)
+    )
+    return _point_ends(
+        Tree(nodes + suppleness[:, None] * winding + bend_mm * bends, tree.parent, radius), extent_mm
+    )
 
 
-def _pointed(tree: Tree, extent_mm: float) -> Tree:
+def _point_ends(tree: Tree, extent_mm: float) -> Tree:
     """The tree whose ends and roots inside the patch are pointed, and that narrows nowhere at once."""
     inside = _inside(tree, extent_mm)
     end, slope = _POINTED
     length = np.hypot(*(tree.nodes - tree.nodes[tree.parent]).T)
-    most = np.where(inside, end, np.inf)
-    childless = np.bincount(tree.parent + 1, minlength=len(most) + 1)[1:] == 0
-    wide, limit = tree.radius.tolist(), np.where(childless, most, 0.0).tolist()
-    for k, up in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
-        wide[k] = min(wide[k], limit[k])
-        if up >= 0:
-            limit[up] = max(limit[up], _WIDENS * wide[k] + slope * float(length[k]))
-    left = remaining(tree.nodes, tree.parent, np.where(inside, 0.0, _ENDS_MM[-1]))
-    radius, trunk = np.minimum(wide, np.interp(left, _ENDS_MM, _ENDS, right=np.inf)), _trunk_of(tree)
+    limits = np.where(inside, end, np.inf)
+    childless = np.bincount(tree.parent + 1, minlength=len(limits) + 1)[1:] == 0
+    radii, limit = tree.radius.tolist(), np.where(childless, limits, 0.0).tolist()
+    for k, parent in reversed(list(enumerate(tree.parent.tolist()))):  # children come after their parents
+        radii[k] = min(radii[k], limit[k])
+        if parent >= 0:
+            limit[parent] = max(limit[parent], _WIDENS * radii[k] + slope * float(length[k]))
+    remaining_mm = remaining_length(tree.nodes, tree.parent, np.where(inside, 0.0, _ENDS_MM[-1]))
+    radius, trunk = (
+        np.minimum(radii, np.interp(remaining_mm, _ENDS_MM, _ENDS, right=np.inf)),
+        _find_trunks(tree),
+    )
     for root in np.flatnonzero((tree.parent < 0) & inside):
-        away = np.hypot(*(tree.nodes - tree.nodes[root]).T)
-        radius = np.where(trunk == root, np.minimum(radius, end + slope * away), radius)
+        distance = np.hypot(*(tree.nodes - tree.nodes[root]).T)
+        radius = np.where(trunk == root, np.minimum(radius, end + slope * distance), radius)
     return Tree(tree.nodes, tree.parent, radius)
 
 
-def _trunk_of(tree: Tree) -> Ints:
+def _find_trunks(tree: Tree) -> Ints:
     """The root (N,) that each node goes back to."""
     trunk = np.where(tree.parent >= 0, tree.parent, np.arange(len(tree.nodes)))
     while (trunk[trunk] != trunk).any():
@@ -253,69 +270,75 @@ def _trunk_of(tree: Tree) -> Ints:
     return trunk
 
 
-def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
+def _grow(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
     """One kind of vessel; `density` (m, m): share of its ends that stay."""
-    way = lattice(extent_mm, kind.coarse * max(_FINEST_MM, extent_mm / _MOST), rng)
-    depth = noise.sample(sulci, way.points, extent_mm)
-    clouds = noise.sample(noise.band(rng, 128, extent_mm, 2.0, 0.7), way.points, extent_mm)
+    grid = lattice(extent_mm, kind.coarse * max(_FINEST_MM, extent_mm / _MOST), rng)
+    depth = noise.sample(sulci, grid.points, extent_mm)
+    clouds = noise.sample(noise.band(rng, 128, extent_mm, 2.0, 0.7), grid.points, extent_mm)
     chance = np.exp(0.7 * kind.chance * (clouds + rng.standard_normal(len(depth))))
     cost = np.asarray((1 + kind.crown * (1 - np.clip(depth, 0, 1)) ** 2) * chance, np.float64)
-    many = extent_mm / _PATCH_MM
-    roots, deep, out = _trunks(kind, cost, way, many, rng)
-    ends = _ends(kind, way, density, extent_mm, rng)
-    ends = ends[~np.isin(ends, np.concatenate([roots, deep, out]))]
-    starts = np.concatenate([roots, deep])
-    radius = np.concatenate([rng.uniform(*kind.trunk, len(out)), rng.uniform(*kind.end, len(ends))])
-    used = least_cost(way, cost, starts, np.concatenate([out, ends]), radius, kind.sharing)
-    made = halved(joined(used, kind.loops, 3 * kind.spacing, float(np.median(way.lengths)), rng))
-    nodes, parent, own = made.nodes, made.parent, made.radius
-    beyond = np.where(np.arange(len(nodes)) < 2 * len(used.nodes), 0.0, kind.taper)
-    nodes = relaxed(nodes, parent, own, kind.stiff, 100)
-    left = remaining(nodes, parent, beyond)
-    short, long = (
+    patches = extent_mm / _PATCH_MM
+    roots, deep_roots, outlets = _place_trunks(kind, cost, grid, patches, rng)
+    ends = _place_ends(kind, grid, density, extent_mm, rng)
+    ends = ends[~np.isin(ends, np.concatenate([roots, deep_roots, outlets]))]
+    starts = np.concatenate([roots, deep_roots])
+    radius = np.concatenate([rng.uniform(*kind.trunk, len(outlets)), rng.uniform(*kind.end, len(ends))])
+    coarse_tree = least_cost(grid, cost, starts, np.concatenate([outlets, ends]), radius, kind.sharing)
+    tree = subdivide(
+        anastomose(coarse_tree, kind.loops, 3 * kind.spacing, float(np.median(grid.lengths)), rng)
+    )
+    nodes, parent, radii = tree.nodes, tree.parent, tree.radius
+    extra_mm = np.where(np.arange(len(nodes)) < 2 * len(coarse_tree.nodes), 0.0, kind.taper)
+    nodes = relax(nodes, parent, radii, kind.stiff, 100)
+    remaining_mm = remaining_length(nodes, parent, extra_mm)
+    short_waves, long_waves = (
         [noise.sample(noise.band(rng, 128, extent_mm, wave, 0.4), nodes, extent_mm) for _ in range(2)]
         for wave in (1.7, 9.0)
     )
-    supple = kind.bends[0] / (1 + (own / (0.4 * kind.stiff)) ** 2)
-    nodes = nodes + np.stack(short, 1) * supple[:, None] + kind.bends[1] * np.stack(long, 1)
-    own = own * np.where(own > kind.end[1], 1, np.clip(left / kind.taper, 0.05, 1) ** 0.5)
-    if len(deep):  # it comes into sight over a millimetre or two
-        own = own * np.clip(0.2 + cKDTree(way.points[deep]).query(nodes)[0] / 1.5, 0, 1)
+    suppleness = kind.bends[0] / (1 + (radii / (0.4 * kind.stiff)) ** 2)
+    nodes = nodes + np.stack(short_waves, 1) * suppleness[:, None] + kind.bends[1] * np.stack(long_waves, 1)
+    radii = radii * np.where(radii > kind.end[1], 1, np.clip(remaining_mm / kind.taper, 0.05, 1) ** 0.5)
+    if len(deep_roots):  # it comes into sight over a millimetre or two
+        radii = radii * np.clip(0.2 + cKDTree(grid.points[deep_roots]).query(nodes)[0] / 1.5, 0, 1)
     swell = noise.sample(noise.band(rng, 128, extent_mm, 4.0, 0.5), nodes, extent_mm)
-    return Tree(nodes, parent, own * np.clip(1 + 0.1 * swell, 0.75, 1.3))
+    return Tree(nodes, parent, radii * np.clip(1 + 0.1 * swell, 0.75, 1.3))
 
 
-def _trunks(
-    kind: Kind, cost: Floats, way: Lattice, many: float, rng: np.random.Generator
+def _place_trunks(
+    kind: Kind, cost: Floats, grid: Lattice, patches: float, rng: np.random.Generator
 ) -> tuple[Ints, Ints, Ints]:
     """Points where trunks enter at the patch's border, come up in it, and leave it: where ways are cheap."""
-    half = np.abs(way.points).max()
-    out = np.abs(way.points).max(axis=1)
-    angle = np.arctan2(way.points[:, 1], way.points[:, 0])
-    border, inner = np.flatnonzero(out > 0.93 * half), np.flatnonzero(out < 0.7 * half)
+    half = np.abs(grid.points).max()
+    radius = np.abs(grid.points).max(axis=1)
+    angle = np.arctan2(grid.points[:, 1], grid.points[:, 0])
+    border, inner = np.flatnonzero(radius > 0.93 * half), np.flatnonzero(radius < 0.7 * half)
 
-    def cheapest(towards: Floats) -> Ints:
-        apart = np.abs(np.angle(np.exp(1j * (angle[border] - towards[:, None]))))
-        return np.asarray(border[np.argmin(np.log(cost[border]) + 6 * apart, axis=1)])
+    def find_cheapest(directions: Floats) -> Ints:
+        separation = np.abs(np.angle(np.exp(1j * (angle[border] - directions[:, None]))))
+        return np.asarray(border[np.argmin(np.log(cost[border]) + 6 * separation, axis=1)])
 
-    count, leaving = (max(1, round(many * rng.integers(*of))) for of in (kind.roots, kind.through))
-    within = round(many * rng.integers(*kind.inside))
-    first = rng.uniform(0, 2 * np.pi) + (np.arange(count) + rng.uniform(-0.3, 0.3, count)) * 2 * np.pi / count
-    across = first[np.arange(leaving) % count] + rng.uniform(0.7, 1.3, leaving) * np.pi
-    chosen = rng.choice(inner, (within, 40))
-    deep = chosen[np.arange(within), np.argmin(cost[chosen], axis=1)]
-    roots, out = np.unique(cheapest(first)), np.unique(cheapest(across))
-    return roots, np.unique(deep), out[~np.isin(out, roots)]
+    count, outlet_count = (
+        max(1, round(patches * rng.integers(*limits))) for limits in (kind.roots, kind.through)
+    )
+    inner_count = round(patches * rng.integers(*kind.inside))
+    root_angles = (
+        rng.uniform(0, 2 * np.pi) + (np.arange(count) + rng.uniform(-0.3, 0.3, count)) * 2 * np.pi / count
+    )
+    outlet_angles = root_angles[np.arange(outlet_count) % count] + rng.uniform(0.7, 1.3, outlet_count) * np.pi
+    candidates = rng.choice(inner, (inner_count, 40))
+    deep_roots = candidates[np.arange(inner_count), np.argmin(cost[candidates], axis=1)]
+    roots, outlets = np.unique(find_cheapest(root_angles)), np.unique(find_cheapest(outlet_angles))
+    return roots, np.unique(deep_roots), outlets[~np.isin(outlets, roots)]
 
 
-def _ends(kind: Kind, way: Lattice, density: Map, extent_mm: float, rng: np.random.Generator) -> Ints:
+def _place_ends(kind: Kind, grid: Lattice, density: Map, extent_mm: float, rng: np.random.Generator) -> Ints:
     """Points about `kind.spacing` apart: of a jittered grid, which neither clumps nor lines up, a share."""
-    points = _jittered(kind.spacing, extent_mm, rng)
+    points = _jitter_grid(kind.spacing, extent_mm, rng)
     points = points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
-    return np.unique(cKDTree(way.points).query(points)[1])
+    return np.unique(cKDTree(grid.points).query(points)[1])
 
 
-def _jittered(spacing: float, extent_mm: float, rng: np.random.Generator) -> Floats:
+def _jitter_grid(spacing: float, extent_mm: float, rng: np.random.Generator) -> Floats:
     """A point (N, 2) mm somewhere in each cell of a grid: they neither clump nor line up."""
     side = max(1, int(extent_mm / spacing))
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)

@@ -63,25 +63,28 @@ def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
     distance = float(np.linalg.norm(camera.centre)) * (1.05 if lighting.lamps else 1.0)
     # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is at an angle to it.
     total = lighting.power * np.pi * distance**2
-    own = _WINDOW_DEG, blackbody(lighting.kelvin)
-    usual = (lighting.main, 0), (1 - lighting.main, 1)
-    drawn = [(a.share, a.window_deg, np.array(a.colour), _free(camera, a)) for a in lighting.lamps]
-    drawn = drawn or [(share, *own, _towards(camera, lighting, side)) for share, side in usual]
-    made = []
-    for share, window_deg, colour, towards in drawn:
-        intensity = share * total * colour / max(float(towards[2]), 0.3)
-        window = distance * float(np.tan(np.deg2rad(window_deg)))
-        made.append(Lamp(distance * towards, np.zeros(3), window, intensity))
-    return tuple(made)
+    window = _WINDOW_DEG, blackbody(lighting.kelvin)
+    sides = (lighting.main, 0), (1 - lighting.main, 1)
+    beams = [
+        (lamp.share, lamp.window_deg, np.array(lamp.colour), _free_direction(camera, lamp))
+        for lamp in lighting.lamps
+    ]
+    beams = beams or [(share, *window, _lamp_direction(camera, lighting, side)) for share, side in sides]
+    sources = []
+    for share, window_deg, colour, direction in beams:
+        intensity = share * total * colour / max(float(direction[2]), 0.3)
+        radius = distance * float(np.tan(np.deg2rad(window_deg)))
+        sources.append(Lamp(distance * direction, np.zeros(3), radius, intensity))
+    return tuple(sources)
 
 
 def mirror_slopes(camera: Camera, lamp: Lamp) -> tuple[float, float, float]:
     """Slopes dz/dx and dz/dy at the origin of a surface that mirrors a lamp into the lens, and by how much
     both rise with x and y [1/mm]."""
     distances = np.linalg.norm([camera.centre, lamp.position], axis=1)
-    facing = camera.centre / distances[0] + lamp.position / distances[1]
-    x, y = (-facing[:2] / facing[2]).tolist()
-    return x, y, float((1 / distances).sum() / facing[2])
+    half_vector = camera.centre / distances[0] + lamp.position / distances[1]
+    x, y = (-half_vector[:2] / half_vector[2]).tolist()
+    return x, y, float((1 / distances).sum() / half_vector[2])
 
 
 def spot(camera: Camera, rest: Camera, even: float) -> Map:
@@ -100,44 +103,44 @@ def spot(camera: Camera, rest: Camera, even: float) -> Map:
     columns, rows = (np.linspace(0, n - 1, _RAYS) for n in (width, height))
     x, y = np.meshgrid((columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.rotation
-    met = camera.centre - (camera.centre @ axis / (rays @ axis))[..., None] * rays
+    points = camera.centre - (camera.centre @ axis / (rays @ axis))[..., None] * rays
     half = even / _EDGE
-    share = 1 / (1 + (np.linalg.norm(met, axis=-1) / (field * half)) ** 4)
-    inner = (_OPENING / half) ** 2
-    share *= min(inner / np.arctan(inner), _BRIGHTEST)
+    share = 1 / (1 + (np.linalg.norm(points, axis=-1) / (field * half)) ** 4)
+    ratio = (_OPENING / half) ** 2
+    share *= min(ratio / np.arctan(ratio), _BRIGHTEST)
     across, down = (np.linspace(0, _RAYS - 1, n, dtype=np.float32) for n in (width, height))
     share = cv2.remap(share.astype(np.float32), *np.meshgrid(across, down), cv2.INTER_LINEAR)
     return np.asarray(share, np.float32)
 
 
-def _leaning(camera: Camera, lean: float, turn: float) -> Floats:
+def _tilt_axis(camera: Camera, tilt: float, turn: float) -> Floats:
     """Unit direction (3,) at an angle to the optical axis, and about it in the picture [rad]."""
     axis, (right, down, _) = camera.centre / np.linalg.norm(camera.centre), camera.rotation
-    return np.asarray(np.cos(lean) * axis + np.sin(lean) * (np.cos(turn) * right + np.sin(turn) * down))
+    return np.asarray(np.cos(tilt) * axis + np.sin(tilt) * (np.cos(turn) * right + np.sin(turn) * down))
 
 
-def _free(camera: Camera, lamp: FreeLamp) -> Floats:
+def _free_direction(camera: Camera, lamp: FreeLamp) -> Floats:
     """Unit direction (3,) of a lamp, at least `_LOWEST` above the opening's plane."""
-    towards = _leaning(camera, *np.deg2rad([lamp.tilt_deg, lamp.azimuth_deg]))
-    flat = towards[:2] * min(1.0, np.sqrt(1 - _LOWEST**2) / max(np.linalg.norm(towards[:2]), 1e-9))
-    return np.append(flat, max(towards[2], _LOWEST))
+    direction = _tilt_axis(camera, *np.deg2rad([lamp.tilt_deg, lamp.azimuth_deg]))
+    horizontal = direction[:2] * min(1.0, np.sqrt(1 - _LOWEST**2) / max(np.linalg.norm(direction[:2]), 1e-9))
+    return np.append(horizontal, max(direction[2], _LOWEST))
 
 
-def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:
+def _lamp_direction(camera: Camera, lighting: Lighting, side: float) -> Floats:
     """Unit direction (3,) from the craniotomy to the main lamp (side 0) or to the one across the lens (1)."""
     axis = camera.centre / np.linalg.norm(camera.centre)
     turn = np.deg2rad(lighting.azimuth_deg) + side * _APART
     if lighting.tilt_deg is not None:
-        return _leaning(camera, np.deg2rad(lighting.tilt_deg), turn)
+        return _tilt_axis(camera, np.deg2rad(lighting.tilt_deg), turn)
     turn = turn + np.arctan2(axis[1], axis[0])
     slope = np.deg2rad(lighting.mirror_deg)
-    facing = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
-    mirrored = 2 * (axis @ facing) * facing - axis
-    lean, most = np.arccos(np.clip(mirrored @ axis, -1, 1)), np.deg2rad(_STEEPEST_DEG)
-    if lean > most:
-        across = mirrored - (mirrored @ axis) * axis
-        mirrored = np.cos(most) * axis + np.sin(most) * across / np.linalg.norm(across)
-    return np.asarray(mirrored)
+    normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
+    direction = 2 * (axis @ normal) * normal - axis
+    tilt, steepest = np.arccos(np.clip(direction @ axis, -1, 1)), np.deg2rad(_STEEPEST_DEG)
+    if tilt > steepest:
+        across = direction - (direction @ axis) * axis
+        direction = np.cos(steepest) * axis + np.sin(steepest) * across / np.linalg.norm(across)
+    return np.asarray(direction)
 
 
 def balance(kelvin: float) -> tuple[float, float, float]:

@@ -53,38 +53,40 @@ def glow(shape: Shape, alpha: Floats, bare: Floats, theatre: Theatre) -> Floats:
     `alpha`: (V,) GGX roughness of the mirrors; `bare`: (V,) share of them that is metal, else plastic.
     """
     normal = normals(shape)
-    towards = theatre.lens - shape.vertices
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    facing = np.einsum("nc,nc->n", normal, towards)[:, None]
-    seen = _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
+    view = theatre.lens - shape.vertices
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    cosines = np.einsum("nc,nc->n", normal, view)[:, None]
+    radiance = _surroundings(shape.vertices, 2 * cosines * normal - view, alpha, theatre) * theatre.light
     rise = np.interp(bare, (0, 1), _GRAZING)[:, None]
-    return np.asarray(seen * (1 + rise * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
+    return np.asarray(radiance * (1 + rise * np.clip(1 - cosines, 0, 1) ** 5))  # C. Schlick, 1994
 
 
 def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
     """Radiance (N, 3) that arrives at places (N, 3) mm from around directions (N, 3)."""
     up, spread = direction[:, 2:], _SPREAD * alpha
-    below = 1 / (1 + np.exp(np.clip((up + 0.05) / np.hypot(0.09, alpha)[:, None], -40, 40)))
+    downward_share = 1 / (1 + np.exp(np.clip((up + 0.05) / np.hypot(0.09, alpha)[:, None], -40, 40)))
     # Intersection of the mirrored ray with the wound's plane; nearly level ones meet drapes.
-    far = np.maximum(place[:, 2], 0.0) / np.maximum(-direction[:, 2], 0.05 + 0.5 * spread)
-    met, width = place[:, :2] + far[:, None] * direction[:, :2], far * spread
-    row, column = ((met / theatre.extent_mm + 0.5) * len(theatre.wound) - 0.5).T[::-1]
-    at = np.stack([np.interp(width, _BLURRED_MM, np.arange(len(_BLURRED_MM))), row, column])
-    wound = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in theatre.blurred], axis=-1)
-    edge = (np.linalg.norm(met, axis=1) - _FADE_MM) / (3.0 + 0.6 * width)
-    lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
-    lost, low = _DARKER
-    shaded = _SHADED * (1 - lost * np.exp(-np.maximum(place[:, 2:], 0.0) / low))
-    ground = lit * shaded * wound**_TWICE + (1 - lit) * _DRAPE
-    high = np.clip(up, 0, 1)
-    above = (1 - high) * _DRAPE + high * _CEILING + _panels(direction, spread)[:, None]
-    return np.asarray(below * ground + (1 - below) * above)
+    range_mm = np.maximum(place[:, 2], 0.0) / np.maximum(-direction[:, 2], 0.05 + 0.5 * spread)
+    points, width = place[:, :2] + range_mm[:, None] * direction[:, :2], range_mm * spread
+    row, column = ((points / theatre.extent_mm + 0.5) * len(theatre.wound) - 0.5).T[::-1]
+    coordinates = np.stack([np.interp(width, _BLURRED_MM, np.arange(len(_BLURRED_MM))), row, column])
+    wound = np.stack(
+        [map_coordinates(plane, coordinates, order=1, mode="nearest") for plane in theatre.blurred], axis=-1
+    )
+    edge = (np.linalg.norm(points, axis=1) - _FADE_MM) / (3.0 + 0.6 * width)
+    lit_share = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
+    loss, height = _DARKER
+    shade = _SHADED * (1 - loss * np.exp(-np.maximum(place[:, 2:], 0.0) / height))
+    ground = lit_share * shade * wound**_TWICE + (1 - lit_share) * _DRAPE
+    elevation = np.clip(up, 0, 1)
+    sky = (1 - elevation) * _DRAPE + elevation * _CEILING + _panels(direction, spread)[:, None]
+    return np.asarray(downward_share * ground + (1 - downward_share) * sky)
 
 
 def _panels(direction: Floats, spread: Floats) -> Floats:
     """Radiance (N,) of light boxes on walls around directions (N, 3) of a standard deviation (N,) rad."""
     turns, half, radiance = _PANELS
     width = np.hypot(half, spread)
-    away = np.arctan2(direction[:, 1], direction[:, 0]) - np.array(turns)[:, None]
-    across = np.exp(-((np.angle(np.exp(1j * away)) / width) ** 2)).sum(axis=0) * half / width
-    return np.asarray(radiance * across * np.exp(-(((direction[:, 2] - 0.3) / np.hypot(0.4, spread)) ** 2)))
+    angles = np.arctan2(direction[:, 1], direction[:, 0]) - np.array(turns)[:, None]
+    profile = np.exp(-((np.angle(np.exp(1j * angles)) / width) ** 2)).sum(axis=0) * half / width
+    return np.asarray(radiance * profile * np.exp(-(((direction[:, 2] - 0.3) / np.hypot(0.4, spread)) ** 2)))

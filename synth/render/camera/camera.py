@@ -129,19 +129,19 @@ def visible_radius(camera: Camera) -> float:
     """Radius [mm] of the largest circle around the craniotomy's centre, in its plane, that is in the picture.
     Raises as `rays`."""
     (width, height), side = camera.size, np.linspace(-0.5, 0.5, _BORDER)
-    across = [(x, y) for x in side for y in (-0.5, 0.5)]
-    edge = np.array(across + [(y, x) for x, y in across])
+    sides = [(x, y) for x in side for y in (-0.5, 0.5)]
+    edge = np.array(sides + [(y, x) for x, y in sides])
     pixels = edge * (width, height) + 0.5 * np.array([width - 1, height - 1])
-    away = rays(camera, pixels) @ camera.rotation
+    directions = rays(camera, pixels) @ camera.rotation
     # A ray that does not come down to the plane meets it very far away.
-    met = camera.centre - away * (camera.centre[2] / np.minimum(away[:, 2], -1e-9))[:, None]
-    return float(np.hypot(met[:, 0], met[:, 1]).min())
+    points = camera.centre - directions * (camera.centre[2] / np.minimum(directions[:, 2], -1e-9))[:, None]
+    return float(np.hypot(points[:, 0], points[:, 1]).min())
 
 
 def resize(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with pictures of another size (width, height) px of the same field."""
     scale = np.array(size) / camera.size
-    K = camera_calibration.scaled(camera.K, scale)
+    K = camera_calibration.scale_intrinsics(camera.K, scale)
     return replace(camera, K=K, size=size, mm_per_px=camera.mm_per_px / float(scale[0]))
 
 
@@ -152,20 +152,20 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
 
 
-def calibrated_right(
+def place_right(
     camera: Camera, K: Floats, distortion: Floats, rotation: Floats, translation: Floats
 ) -> Camera:
     """The right camera of a calibrated pair, focused on the same plane: x_right = rotation @ x_left +
     translation, (3, 3) and (3,) mm."""
-    moved = rotation @ camera.translation + translation
+    right_translation = rotation @ camera.translation + translation
     return replace(
         camera,
         K=K,
         distortion=distortion,
         rotation=rotation @ camera.rotation,
-        translation=moved,
-        focus_mm=float(moved[2] + camera.focus_mm - camera.translation[2]),
-        mm_per_px=float(moved[2] / K[0, 0]),
+        translation=right_translation,
+        focus_mm=float(right_translation[2] + camera.focus_mm - camera.translation[2]),
+        mm_per_px=float(right_translation[2] / K[0, 0]),
     )
 
 
@@ -179,24 +179,27 @@ def disparity(left: Camera, right: Camera, points: Floats) -> Floats:
     """Column [px] of points (N, 3) mm, left camera's axes, in the left picture less that in the right one,
     (N,), without distortion."""
     turn, shift = between(left, right)
-    there = points @ turn.T + shift
-    (x, z), (x_there, z_there) = (one[:, ::2].T for one in (points, there))
-    own, other = left.K[0, 0] * x / z + left.K[0, 2], right.K[0, 0] * x_there / z_there + right.K[0, 2]
-    return np.asarray(own - other)
+    right_points = points @ turn.T + shift
+    (x, z), (x_right, z_right) = (coordinates[:, ::2].T for coordinates in (points, right_points))
+    left_column, right_column = (
+        left.K[0, 0] * x / z + left.K[0, 2],
+        right.K[0, 0] * x_right / z_right + right.K[0, 2],
+    )
+    return np.asarray(left_column - right_column)
 
 
-def depth_of(left: Camera, right: Camera, along: Floats, disparity_px: Floats) -> Floats:
-    """Depth (N,) mm in the left camera of points on its rays `along` (N, 3), z = 1, by their disparities."""
+def depth_of(left: Camera, right: Camera, directions: Floats, disparity_px: Floats) -> Floats:
+    """Depth (N,) mm in the left camera of points on its rays `directions` (N, 3), z = 1, by disparities."""
     turn, shift = between(left, right)
-    there = along @ turn.T
-    x = (left.K[0, 0] * along[:, 0] + left.K[0, 2] - disparity_px - right.K[0, 2]) / right.K[0, 0]
-    return np.asarray((x * shift[2] - shift[0]) / (there[:, 0] - x * there[:, 2]))
+    right_directions = directions @ turn.T
+    x = (left.K[0, 0] * directions[:, 0] + left.K[0, 2] - disparity_px - right.K[0, 2]) / right.K[0, 0]
+    return np.asarray((x * shift[2] - shift[0]) / (right_directions[:, 0] - x * right_directions[:, 2]))
 
 
 def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> Map:
     """Radius of the circle of confusion [px] of points at depths (...) mm; 0 where depth is 0."""
-    away = np.maximum(depth, 1e-9)
-    radius = camera.K[0, 0] * camera.aperture_mm * np.abs(1 / away - 1 / camera.focus_mm)
+    distance = np.maximum(depth, 1e-9)
+    radius = camera.K[0, 0] * camera.aperture_mm * np.abs(1 / distance - 1 / camera.focus_mm)
     return np.where(depth > 0, radius, 0.0).astype(np.float32)
 
 
@@ -234,27 +237,27 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
     """Inverse of Brown-Conrady on normalised coordinates (N, 2), by Newton's method to rounding."""
     if not distortion.any():
         return flat.copy()
-    found = np.empty(flat.shape)
-    if _undistort(np.ascontiguousarray(flat), _eight(distortion), found):
-        return found
+    points = np.empty(flat.shape)
+    if _undistort(np.ascontiguousarray(flat), _pad_coefficients(distortion), points):
+        return points
     raise UserError("render.distortion: folds the picture over itself (or the calibration's does)")
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:
     if not distortion.any():
         return flat
-    found = np.empty(flat.shape)
-    _distort_all(np.ascontiguousarray(flat), _eight(distortion), found)
-    return found
+    points = np.empty(flat.shape)
+    _distort_all(np.ascontiguousarray(flat), _pad_coefficients(distortion), points)
+    return points
 
 
-def _eight(distortion: Floats) -> Floats:
+def _pad_coefficients(distortion: Floats) -> Floats:
     """All coefficients (8,), those of the rational model 0 if they are not given."""
     return np.concatenate([distortion, np.zeros(8 - len(distortion))])
 
 
 @inlined
-def _stretch(r2: float, k: Floats) -> tuple[float, float]:
+def _radial_factor(r2: float, k: Floats) -> tuple[float, float]:
     """The radial factor at a squared radius, and twice its derivative by it; coefficients (8,)."""
     top = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     bottom = 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
@@ -263,10 +266,10 @@ def _stretch(r2: float, k: Floats) -> tuple[float, float]:
 
 
 @inlined
-def _bend(x: float, y: float, k: Floats) -> tuple[float, float]:
+def _distort_point(x: float, y: float, k: Floats) -> tuple[float, float]:
     """A point as distorted by coefficients (8,)."""
     r2 = x * x + y * y
-    radial, _ = _stretch(r2, k)
+    radial, _ = _radial_factor(r2, k)
     across = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
     down = y * radial + 2 * k[3] * x * y + k[2] * (r2 + 2 * y * y)
     return across, down
@@ -274,32 +277,32 @@ def _bend(x: float, y: float, k: Floats) -> tuple[float, float]:
 
 @argument_types("f8[:,::1], f8[::1], f8[:,::1]")
 @vectorised
-def _distort_all(flat: Floats, k: Floats, found: Floats) -> None:
+def _distort_all(flat: Floats, k: Floats, out: Floats) -> None:
     for n in range(len(flat)):
-        found[n, 0], found[n, 1] = _bend(flat[n, 0], flat[n, 1], k)
+        out[n, 0], out[n, 1] = _distort_point(flat[n, 0], flat[n, 1], k)
 
 
 @argument_types("f8[:,::1], f8[::1], f8[:,::1]")
 @vectorised
-def _undistort(flat: Floats, k: Floats, found: Floats) -> bool:
+def _undistort(flat: Floats, k: Floats, out: Floats) -> bool:
     """Whether all points (N, 2) were found."""
-    good = True
+    converged = True
     for n in range(len(flat)):
         x, y = flat[n, 0], flat[n, 1]
         for _ in range(_NEWTON):
-            u, v = _bend(x, y, k)
+            u, v = _distort_point(x, y, k)
             u, v = u - flat[n, 0], v - flat[n, 1]
             if abs(u) < _ROUNDING and abs(v) < _ROUNDING:
                 break
             # The Jacobian, which is symmetric.
             r2 = x * x + y * y
-            radial, growth = _stretch(r2, k)
+            radial, growth = _radial_factor(r2, k)
             b = growth * x * y + 2 * k[2] * x + 2 * k[3] * y
             a = radial + growth * x * x + 2 * k[2] * y + 6 * k[3] * x
             d = radial + growth * y * y + 2 * k[3] * x + 6 * k[2] * y
             determinant = a * d - b * b
             x, y = x - (d * u - b * v) / determinant, y - (a * v - b * u) / determinant
-        u, v = _bend(x, y, k)
-        good &= abs(u - flat[n, 0]) < 1e-9 and abs(v - flat[n, 1]) < 1e-9  # not if they are NaN
-        found[n, 0], found[n, 1] = x, y
-    return good
+        u, v = _distort_point(x, y, k)
+        converged &= abs(u - flat[n, 0]) < 1e-9 and abs(v - flat[n, 1]) < 1e-9  # not if they are NaN
+        out[n, 0], out[n, 1] = x, y
+    return converged

@@ -19,18 +19,18 @@ def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
     Raises UserError also for a lens with further coefficients.
     """
     with as_user_error("render.calibration"):
-        K, lens = camera_file.read_lens(path, size)
-    return K, rendered(lens, path)
+        K, distortion = camera_file.read_lens(path, size)
+    return K, trim_distortion(distortion, path)
 
 
-def rendered(lens: Floats, path: Path) -> Floats:
+def trim_distortion(distortion: Floats, path: Path) -> Floats:
     """Distortion (5,) or (8,) of a calibration's (4 to 14,). UserError for one that can't be rendered."""
-    if lens[_RATIONAL:].any():
+    if distortion[_RATIONAL:].any():
         raise UserError(f"render.calibration: {path}: has thin-prism distortion, which is not rendered")
-    return np.append(lens, np.zeros(_RATIONAL))[: _RATIONAL if lens[5:].any() else 5]
+    return np.append(distortion, np.zeros(_RATIONAL))[: _RATIONAL if distortion[5:].any() else 5]
 
 
-def scaled(K: Floats, scale: Floats) -> Floats:
+def scale_intrinsics(K: Floats, scale: Floats) -> Floats:
     """K (3, 3) of pictures that are wider and higher by factors (2,)."""
     K = K * np.append(scale, 1.0)[:, None]
     K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from synth.arrays import Map, Pixels
-from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, Matrix, encoded
+from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, Matrix, encode_srgb
 from synth.system.jit import argument_types, vectorised
 
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
@@ -51,18 +51,18 @@ def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Pix
     """The sRGB picture (H, W, 3) uint8 of linear radiance (H, W, 3) float32; `rng`: of the noise."""
     size = radiance.shape[1::-1]
     if sensor.native < 1:
-        fewer = [max(round(sensor.native * side), 8) for side in size]
-        radiance = cv2.resize(radiance, fewer, interpolation=cv2.INTER_AREA)
-    video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
+        sensor_size = [max(round(sensor.native * side), 8) for side in size]
+        radiance = cv2.resize(radiance, sensor_size, interpolation=cv2.INTER_AREA)
+    video = process_colours(expose(radiance, sensor, rng), sensor.matrix, sensor.curves)
     video = _sharpen(video, sensor.sharpening, sensor.halo_px)
     if sensor.native < 1:
         video = cv2.resize(video, size, interpolation=cv2.INTER_CUBIC)
     np.clip(video, 0, 1, out=video)
-    video = video if sensor.coded else _subsampled(video, sensor.chroma)
+    video = video if sensor.coded else _subsample_chroma(video, sensor.chroma)
     return np.asarray(np.rint(np.clip(video, 0, 1) * np.float32(255)), np.uint8)
 
 
-def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Map:
+def expose(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Map:
     """White-balanced signal of the chip for radiance (H, W, 3): 1 at full scale, up to `_HEADROOM`."""
     white = np.asarray(sensor.white, np.float32)
     # Gains below 1 lower the exposure instead, so that what saturates the sensor is white.
@@ -71,18 +71,18 @@ def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator
     if sensor.blur > 0:
         light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
     light = _scatter(light, sensor.bloom)
-    balanced = rng.standard_normal(light.shape, dtype=np.float32)
-    well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
+    signal = rng.standard_normal(light.shape, dtype=np.float32)
+    well, read_variance = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
     steps = np.float32(2**sensor.bits - 1) / np.float32(_HEADROOM)
-    _convert(np.asarray(light, np.float32), well, read, steps, white / least, balanced)
-    return balanced
+    _convert(np.asarray(light, np.float32), well, read_variance, steps, white / least, signal)
+    return signal
 
 
-def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
+def process_colours(linear: Map, matrix: Matrix, curves: Curves) -> Map:
     """Video levels of balanced light (H, W, 3), `_HEADROOM` at most: a matrix, then a curve per channel.
 
     Between knots a curve is monotone (F. N. Fritsch, R. E. Carlson, 1980) over sRGB-encoded light; levels of
-    `encoded(KNOTS)` give plain sRGB. Black is 0.
+    `encode_srgb(KNOTS)` give plain sRGB. Black is 0.
     """
     video = np.empty(linear.shape, np.float32)
     light = np.ascontiguousarray(linear, np.float32)
@@ -94,42 +94,42 @@ def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
 @lru_cache(16)
 def _table(curve: Curve) -> Map:
     """A tone curve, tabulated in `_STEPS` per full scale."""
-    levels = encoded(np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1))
-    curve_of = PchipInterpolator(encoded(np.array([0.0, *KNOTS])), [0.0, *curve])
-    return np.asarray(curve_of(levels), np.float32)
+    levels = encode_srgb(np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1))
+    spline = PchipInterpolator(encode_srgb(np.array([0.0, *KNOTS])), [0.0, *curve])
+    return np.asarray(spline(levels), np.float32)
 
 
 @argument_types("f4[:,:,::1], f4, f4, f4, f4[::1], f4[:,:,::1]")
 @vectorised
 def _convert(
-    light: Map, well: np.float32, read: np.float32, steps: np.float32, white: Map, noise: Map
+    light: Map, well: np.float32, read_variance: np.float32, steps: np.float32, white: Map, noise: Map
 ) -> None:
     """Noise, converter with `steps` per full scale, and white balance, up to `_HEADROOM`.
 
     Normal `noise` (H, W, 3) is overwritten by the result.
     """
-    zero, most = np.float32(0), np.float32(_HEADROOM)
+    zero, full_scale = np.float32(0), np.float32(_HEADROOM)
     for y in range(light.shape[0]):
         for x in range(light.shape[1]):
             for k in range(3):
                 electrons = max(light[y, x, k], zero) * well
                 # A Poisson count this large is a Gaussian to within the readout noise.
-                electrons = electrons + noise[y, x, k] * np.sqrt(electrons + read)
-                digital = np.rint(min(max(electrons / well, zero), most) * steps) / steps
-                noise[y, x, k] = min(max(digital * white[k], zero), most)
+                electrons = electrons + noise[y, x, k] * np.sqrt(electrons + read_variance)
+                digital = np.rint(min(max(electrons / well, zero), full_scale) * steps) / steps
+                noise[y, x, k] = min(max(digital * white[k], zero), full_scale)
 
 
-def _subsampled(video: Map, chroma: str) -> Map:
+def _subsample_chroma(video: Map, chroma: str) -> Map:
     """Video with its colour at half the resolution across, or across and down."""
     if chroma == "4:4:4":
         return video
     height, width = video.shape[:2]
-    small = ((width + 1) // 2, height if chroma == "4:2:2" else (height + 1) // 2)
-    parts = cv2.cvtColor(np.ascontiguousarray(video, np.float32), cv2.COLOR_RGB2YCrCb)
+    chroma_size = ((width + 1) // 2, height if chroma == "4:2:2" else (height + 1) // 2)
+    planes = cv2.cvtColor(np.ascontiguousarray(video, np.float32), cv2.COLOR_RGB2YCrCb)
     for channel in (1, 2):
-        coarse = cv2.resize(parts[..., channel], small, interpolation=cv2.INTER_AREA)
-        parts[..., channel] = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.cvtColor(parts, cv2.COLOR_YCrCb2RGB), np.float32)
+        coarse = cv2.resize(planes[..., channel], chroma_size, interpolation=cv2.INTER_AREA)
+        planes[..., channel] = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(planes, cv2.COLOR_YCrCb2RGB), np.float32)
 
 
 def _falloff(shape: tuple[int, int], vignette: float) -> Map:
@@ -142,8 +142,8 @@ def _falloff(shape: tuple[int, int], vignette: float) -> Map:
 def _scatter(light: Map, share: float) -> Map:
     """Light with a narrow halo around bright spots, at the spots' expense."""
     sigma = light.shape[1] / 200
-    small = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    halo = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(sigma / 2, 0.5)), light.shape[1::-1])
+    half_size = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    halo = cv2.resize(cv2.GaussianBlur(half_size, (0, 0), max(sigma / 2, 0.5)), light.shape[1::-1])
     return np.asarray((1 - share) * light + share * halo, np.float32)
 
 
@@ -151,21 +151,23 @@ def _scatter(light: Map, share: float) -> Map:
 @vectorised
 def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: Map) -> None:
     """Writes to `video` a matrix (3, 3) on linear (H, W, 3), then tabulated curves."""
-    most, steps = np.float32(len(red) - 1.001), np.float32(_STEPS)
+    last, steps = np.float32(len(red) - 1.001), np.float32(_STEPS)
     for y in range(linear.shape[0]):
         for x in range(linear.shape[1]):
             r, g, b = linear[y, x, 0] * steps, linear[y, x, 1] * steps, linear[y, x, 2] * steps
             for k, curve in enumerate((red, green, blue)):
-                at = matrix[k, 0] * r + matrix[k, 1] * g + matrix[k, 2] * b
-                at = min(at, most) if at > 0 else np.float32(0)  # also where it is no number
-                low = np.int32(at)
-                video[y, x, k] = curve[low] + (at - np.float32(low)) * (curve[low + 1] - curve[low])
+                level = matrix[k, 0] * r + matrix[k, 1] * g + matrix[k, 2] * b
+                level = min(level, last) if level > 0 else np.float32(0)  # also where it is no number
+                index = np.int32(level)
+                video[y, x, k] = curve[index] + (level - np.float32(index)) * (
+                    curve[index + 1] - curve[index]
+                )
 
 
 def _sharpen(video: Map, amount: float, sigma: float) -> Map:
     if amount == 0:
         return video
-    sharp = cv2.GaussianBlur(video, (0, 0), sigma)
-    np.subtract(video, sharp, out=sharp)
-    sharp *= np.float32(amount)
-    return np.asarray(np.add(video, sharp, out=sharp), np.float32)
+    detail = cv2.GaussianBlur(video, (0, 0), sigma)
+    np.subtract(video, detail, out=detail)
+    detail *= np.float32(amount)
+    return np.asarray(np.add(video, detail, out=detail), np.float32)

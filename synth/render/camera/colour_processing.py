@@ -25,16 +25,16 @@ class ColourProcessing(NamedTuple):
     curves: Curves
 
 
-def encoded(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+def encode_srgb(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     """The sRGB transfer (IEC 61966-2-1) of linear light."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _saturating(*from_xyz: int) -> Matrix:
+def _matrix_from_xyz(*from_xyz: int) -> Matrix:
     """`_SHARE` of a chip's matrix to sRGB, from its matrix from XYZ (times 10,000, in daylight)."""
     from_srgb = np.reshape(from_xyz, (3, 3)) @ np.array(_TO_XYZ)
-    published = np.linalg.inv(from_srgb / from_srgb.sum(axis=1, keepdims=True))
-    red, green, blue = (np.eye(3) + _SHARE * (published - np.eye(3))).round(4).tolist()
+    chip_matrix = np.linalg.inv(from_srgb / from_srgb.sum(axis=1, keepdims=True))
+    red, green, blue = (np.eye(3) + _SHARE * (chip_matrix - np.eye(3))).round(4).tolist()
     return tuple(red), tuple(green), tuple(blue)
 
 
@@ -55,10 +55,10 @@ CAMERAS = (
         ((0.2, 0.43, 0.71, 0.99, 1.0), (0.21, 0.38, 0.76, 0.99, 1.0), (0.19, 0.46, 0.82, 0.96, 1.0)),
     ),
     # One chip: matrices of dcraw's `adobe_coeff` for Canon EOS 5D Mark III, Nikon D800, Sony ILCE-7.
-    ColourProcessing(_saturating(6722, -635, -963, -4287, 12460, 2028, -908, 2162, 5668), (_SOFT,) * 3),
+    ColourProcessing(_matrix_from_xyz(6722, -635, -963, -4287, 12460, 2028, -908, 2162, 5668), (_SOFT,) * 3),
     ColourProcessing(
-        _saturating(7866, -2108, -555, -4869, 12483, 2681, -1176, 2069, 7501), (_FULL, _MIDDLE, _MIDDLE)
+        _matrix_from_xyz(7866, -2108, -555, -4869, 12483, 2681, -1176, 2069, 7501), (_FULL, _MIDDLE, _MIDDLE)
     ),
-    ColourProcessing(_saturating(5271, -712, -347, -6153, 13653, 2763, -1601, 2366, 7242), (_HARD,) * 3),
+    ColourProcessing(_matrix_from_xyz(5271, -712, -347, -6153, 13653, 2763, -1601, 2366, 7242), (_HARD,) * 3),
 )
 """Cameras that a job without `sensor.matrix` and `sensor.curves` draws from."""

@@ -25,17 +25,17 @@ def transmit(pictures: Pixels, fps: float, bitrate_mbps: float | None, chroma: s
 
     height, width = pictures.shape[1:3]
     # With subsampled chroma codecs accept even sizes only.
-    padded = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    even_pictures = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     try:
         with av.open(buffer, "w", format="matroska") as container:
             options = {"threads": "1", "preset": "medium", "tune": "zerolatency"}
             rate, bits_per_s = Fraction(fps).limit_denominator(1000), round(bitrate_mbps * 1e6)
-            encode(container, padded, rate, _FORMATS[chroma], options, bits_per_s=bits_per_s)
+            encode(container, even_pictures, rate, _FORMATS[chroma], options, bits_per_s=bits_per_s)
         buffer.seek(0)
         with av.open(buffer) as container:
             # Bilinear from subsampled chroma, as players do; the default of nearest leaves blocks.
-            back = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     except av.FFmpegError as error:
         raise UserError(f"sensor.bitrate_mbps: the codec rejects this video ({error})") from error
-    return np.stack(back)[:, :height, :width]
+    return np.stack(frames)[:, :height, :width]

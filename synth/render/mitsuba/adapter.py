@@ -43,15 +43,15 @@ def pick(variant: str) -> str:
         os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
     os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(cache.LIMIT_BYTES))
     if variant == "cuda_ad_rgb":
-        if why := gpu.obstacle(gpu.probe()):
-            raise UserError(f"render.variant: cuda_ad_rgb: {why}")
+        if reason := gpu.obstacle(gpu.probe()):
+            raise UserError(f"render.variant: cuda_ad_rgb: {reason}")
         return variant
-    found = llvm.find()
-    if found is None:
+    library = llvm.find()
+    if library is None:
         if variant == "llvm_ad_rgb":
             raise UserError("render.variant: llvm_ad_rgb needs libLLVM 17 or newer (Debian: libllvm19)")
         return "scalar_rgb"
-    os.environ["DRJIT_LIBLLVM_PATH"] = found
+    os.environ["DRJIT_LIBLLVM_PATH"] = library
     return "llvm_ad_rgb"
 
 
@@ -106,11 +106,14 @@ class Stage:
         """Moves a body's vertices (V, 3) mm; `film` and `glow` as of `Body` and `Metal`."""
         import mitsuba as mi
 
-        new = {"positions": vertices, "normals": _bent(vertices, self._bodies[name].faces, film)}
+        attributes = {
+            "positions": vertices,
+            "normals": _film_normals(vertices, self._bodies[name].faces, film),
+        }
         if glow is not None:
-            new["glow"] = _shown(mi, self._bodies[name], glow)
-        for key, values in new.items():
-            flat = _aligned(values, np.float32)
+            attributes["glow"] = _mirror_glow(mi, self._bodies[name], glow)
+        for key, values in attributes.items():
+            flat = _align(values, np.float32)
             self._parameters[f"{name}.vertex_{key}"] = mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
@@ -203,14 +206,14 @@ def _register_glow(variant: str) -> None:
 
 
 def _lamp(mi: Any, lamp: Lamp, weight: float = 1.0) -> dict[str, Any]:
-    towards = lamp.target - lamp.position
-    up = [0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 * np.linalg.norm(towards) else [1.0, 0.0, 0.0]
-    placed = mi.ScalarTransform4f().look_at(lamp.position.tolist(), lamp.target.tolist(), up)
-    placed = placed @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
+    direction = lamp.target - lamp.position
+    up = [0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 * np.linalg.norm(direction) else [1.0, 0.0, 0.0]
+    to_world = mi.ScalarTransform4f().look_at(lamp.position.tolist(), lamp.target.tolist(), up)
+    to_world = to_world @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
     value = (lamp.intensity * (weight == 1) / (np.pi * lamp.radius**2)).tolist()
     # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
     light = {"type": "area", "radiance": {"type": "rgb", "value": value}, "sampling_weight": weight}
-    return {"type": "disk", "to_world": placed, "light": light}
+    return {"type": "disk", "to_world": to_world, "light": light}
 
 
 def _mesh(mi: Any, name: str, body: Body) -> Any:
@@ -223,25 +226,25 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         emitter["radiance"] = {"type": "mesh_attribute", "name": "vertex_glow"}
         emitter["mirror"] = _bitmap(mi, body.material.maps.mirror)
     else:
-        half = cv2.resize(body.material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        emitter["radiance"] = _bitmap(mi, half * np.asarray(body.material.ambient, np.float32))
+        albedo = cv2.resize(body.material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        emitter["radiance"] = _bitmap(mi, albedo * np.asarray(body.material.ambient, np.float32))
     if "scalar" in mi.variant():
         emitter = {"type": "area", "radiance": emitter["radiance"], "sampling_weight": 0.0}
     properties["glow"] = mi.load_dict(emitter)
-    given = {"has_vertex_normals": True, "has_vertex_texcoords": True, "props": properties}
-    mesh = mi.Mesh(name, vertex_count=len(body.vertices), face_count=len(body.faces), **given)
+    options = {"has_vertex_normals": True, "has_vertex_texcoords": True, "props": properties}
+    mesh = mi.Mesh(name, vertex_count=len(body.vertices), face_count=len(body.faces), **options)
     if isinstance(body.material, Metal):
-        mesh.add_attribute("vertex_glow", 3, _aligned(_shown(mi, body, body.material.glow), np.float32))
+        mesh.add_attribute("vertex_glow", 3, _align(_mirror_glow(mi, body, body.material.glow), np.float32))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = _aligned(body.vertices, np.float32)
-    parameters["vertex_normals"] = _aligned(_bent(body.vertices, body.faces, body.film), np.float32)
-    parameters["faces"] = _aligned(body.faces, np.uint32)
-    parameters["vertex_texcoords"] = _aligned(body.uv, np.float32)
+    parameters["vertex_positions"] = _align(body.vertices, np.float32)
+    parameters["vertex_normals"] = _align(_film_normals(body.vertices, body.faces, body.film), np.float32)
+    parameters["faces"] = _align(body.faces, np.uint32)
+    parameters["vertex_texcoords"] = _align(body.uv, np.float32)
     parameters.update()
     return mesh
 
 
-def _shown(mi: Any, body: Body, glow: Floats) -> Floats:
+def _mirror_glow(mi: Any, body: Body, glow: Floats) -> Floats:
     """The radiance (V, 3) of a metal body's `vertex_glow`: that mirrored, which the scalar variant's own area
     light takes at vertices as by the maps there."""
     if "scalar" not in mi.variant() or not isinstance(body.material, Metal):
@@ -249,7 +252,7 @@ def _shown(mi: Any, body: Body, glow: Floats) -> Floats:
     return np.asarray(glow * read_map(body.material.maps.mirror, body.uv))
 
 
-def _bent(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
+def _film_normals(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
     """Unit normals (V, 3) of a mesh under a film of heights (V,) mm."""
     if film is not None:
         vertices = vertices.copy()
@@ -257,15 +260,15 @@ def _bent(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
     return normals(Shape(vertices, faces))
 
 
-def _aligned(values: Array, kind: type[np.generic]) -> Array:
+def _align(values: Array, kind: type[np.generic]) -> Array:
     """The values as one row of a type, in memory aligned to vector registers.
 
     Dr.Jit uses NumPy's memory in place, and compiles separate kernels for aligned and unaligned arrays.
     """
     size = values.size * np.dtype(kind).itemsize
-    raw = np.empty(size + _REGISTER, np.uint8)
-    start = -raw.ctypes.data % _REGISTER
-    flat = raw[start : start + size].view(kind)
+    buffer = np.empty(size + _REGISTER, np.uint8)
+    start = -buffer.ctypes.data % _REGISTER
+    flat = buffer[start : start + size].view(kind)
     flat[:] = values.ravel()
     return flat
 
@@ -279,27 +282,27 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
         steel |= {"metallic": _bitmap(mi, maps.bare), "roughness": _bitmap(mi, (along * across) ** 0.25)}
         steel |= {"anisotropic": _bitmap(mi, (1 - across / along) / 0.9)}
         steel |= {"clearcoat": _bitmap(mi, maps.wet), "clearcoat_gloss": _GLOSS, "eta": _LACQUER}
-        encoded = maps.normal * np.float32(0.5) + np.float32(0.5)
-        bent = {"type": "normalmap", "normalmap": _bitmap(mi, encoded), "steel": steel}
-        return {"type": "twosided", "bent": bent}
-    encoded = material.maps.normal * np.float32(0.5) + np.float32(0.5)
+        encoded_normals = maps.normal * np.float32(0.5) + np.float32(0.5)
+        normal_map = {"type": "normalmap", "normalmap": _bitmap(mi, encoded_normals), "steel": steel}
+        return {"type": "twosided", "bent": normal_map}
+    encoded_normals = material.maps.normal * np.float32(0.5) + np.float32(0.5)
     albedo = mi.load_dict(_bitmap(mi, material.maps.albedo))  # shared by both coats
     plastic = {"type": "roughplastic", "distribution": "ggx", "nonlinear": True}
     plastic |= {"diffuse_reflectance": albedo, "int_ior": material.index}
     film = {"type": "blendbsdf", "weight": _bitmap(mi, material.maps.dry)}
     film |= {"smooth": plastic | {"alpha": material.roughness}}
     film |= {"rough": plastic | {"alpha": material.dry_roughness}}
-    bent = {"type": "normalmap", "normalmap": _bitmap(mi, encoded), "film": film}
-    return {"type": "twosided", "bent": bent}
+    normal_map = {"type": "normalmap", "normalmap": _bitmap(mi, encoded_normals), "film": film}
+    return {"type": "twosided", "bent": normal_map}
 
 
 def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
     texels = image.reshape(*image.shape[:2], -1)
-    given: dict[str, Any]
+    source: dict[str, Any]
     if "scalar" in mi.variant():
-        given = {"bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32))}
+        source = {"bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32))}
     else:  # in place, in a quarter of the time: a bitmap is copied and converted first
-        given = {"data": mi.TensorXf(_aligned(texels, np.float32).reshape(texels.shape))}
+        source = {"data": mi.TensorXf(_align(texels, np.float32).reshape(texels.shape))}
     # Not `accel`: a GPU's texture units interpolate with 8 bits of fraction.
-    how = {"raw": True, "filter_type": "bilinear", "wrap_mode": "clamp", "accel": False}
-    return {"type": "bitmap", **given, **how}
+    options = {"raw": True, "filter_type": "bilinear", "wrap_mode": "clamp", "accel": False}
+    return {"type": "bitmap", **source, **options}

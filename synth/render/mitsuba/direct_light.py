@@ -24,11 +24,11 @@ class Light(NamedTuple):
     """Direct light of a picture, as means over each pixel's paths."""
 
     radiance: Map  # (3, H, W)
-    near: Map  # (3, H, W) its part from steel nearer than the focus and out of focus
+    foreground: Map  # (3, H, W) its part from steel nearer than the focus and out of focus
     cover: Map  # (H, W) share of the paths that end on such steel
     blocked: Map  # (3, H, W) radiance that shadows take from the other paths
     shade: Map  # (H, W) irradiance that shadows take from them
-    arrive: Map  # (H, W) their irradiance without shadows, of the lamps that they sampled
+    irradiance: Map  # (H, W) their irradiance without shadows, of the lamps that they sampled
     radius: Map  # (H, W) px: cover times the radius of the circle of confusion
     steel: Map  # (H, W) share of the paths that end on other steel
 
@@ -46,18 +46,20 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
     seeds = [dr.opaque(mi.UInt32, int(word)) for word in np.random.SeedSequence(seed).generate_state(9)]
     # A path's index has its number within the pixel in its lowest bits; then all bits are reversed.
     shift = dr.opaque(mi.UInt32, int(np.ceil(np.log2(spp))))
-    found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
-    number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
+    shapes = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
+    number = dr.opaque(
+        mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, shapes[0]))[0]) if shapes else 0
+    )
     sums = [dr.zeros(mi.Float, width * height) for _ in range(14)]
-    for before in range(0, spp, _AT_ONCE):
-        count = min(spp - before, _AT_ONCE)
-        first, paths = (dr.opaque(mi.UInt32, whole) for whole in (before, count))
+    for start in range(0, spp, _AT_ONCE):
+        count = min(spp - start, _AT_ONCE)
+        first, paths = (dr.opaque(mi.UInt32, integer) for integer in (start, count))
         path = dr.arange(mi.UInt32, width * height * count)
         pixel = path // paths
         x, y = pixel % width, pixel // width
         index = dr.brev(((_spread(x) | (_spread(y) << 1)) << shift) | (first + path - pixel * paths))
-        inside, aperture, window = (_pair(index, seeds[3 * n : 3 * n + 3]) for n in range(3))
-        place = mi.Point2f((x + inside.x) / width, (y + inside.y) / height)
+        subpixel, aperture, window = (_pair(index, seeds[3 * n : 3 * n + 3]) for n in range(3))
+        place = mi.Point2f((x + subpixel.x) / width, (y + subpixel.y) / height)
         ray, _ = lens.sample_ray_differential(0.0, 0.0, place, aperture)
         si = scene.ray_intersect(ray, mi.RayFlags.All, True)
         hit = si.is_valid()
@@ -73,12 +75,16 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
         depth = dr.dot(si.p - lens.centre, lens.rows[2])
         blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
         steel = hit & (dr.reinterpret_array(mi.UInt32, si.shape) == number)
-        near = steel & (blur > _BLURRED_PX)
-        parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1)))]
-        parts += [(shadow & ~near, (*scattered, weight.y)), (hit & ~near, (weight.y,)), (near, (blur,))]
-        parts += [(steel & ~near, (mi.Float(1),))]
-        for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
-            dr.scatter_add(total, value, pixel, where)
+        in_foreground = steel & (blur > _BLURRED_PX)
+        parts = [(hit, (*radiance,)), (in_foreground, (*radiance, mi.Float(1)))]
+        parts += [
+            (shadow & ~in_foreground, (*scattered, weight.y)),
+            (hit & ~in_foreground, (weight.y,)),
+            (in_foreground, (blur,)),
+        ]
+        parts += [(steel & ~in_foreground, (mi.Float(1),))]
+        for total, (mask, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
+            dr.scatter_add(total, value, pixel, mask)
         dr.eval(sums)
     means = np.stack([np.array(total) for total in sums]).reshape(-1, height, width) * np.float32(1 / spp)
     return Light(means[:3], means[3:6], means[6], means[7:10], *means[10:])
@@ -94,8 +100,8 @@ def _pair(index: Any, seeds: list[Any]) -> Any:
     second = index
     for step, mask in _HALVES:  # Pascal's triangle modulo 2: Sobol's second dimension
         second = second ^ ((second & mask) << step)
-    one, other = ((word ^ seed) >> 8 for word, seed in zip((index, second), seeds[1:], strict=True))
-    return mi.Point2f(mi.Float(one), mi.Float(other)) * 2.0**-24
+    x, y = ((word ^ seed) >> 8 for word, seed in zip((index, second), seeds[1:], strict=True))
+    return mi.Point2f(mi.Float(x), mi.Float(y)) * 2.0**-24
 
 
 def _spread(x: Any) -> Any:

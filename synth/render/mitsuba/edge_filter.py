@@ -37,32 +37,36 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
     sigmas = tuple(mm / mm_per_px for mm in _TRAVELLED_MM)
     if spp >= _ENOUGH:
         picture = np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
-        clear = cv2.merge([*(light.radiance - light.near + light.blocked)])
-        return picture + _scattered(light, light.shade, light.arrive, clear, sigmas)
-    every = light.near, light.radiance - light.near, light.blocked
-    near, behind, blocked = (cv2.merge([*part]) for part in every)
-    cover, arrive, bare = light.cover, light.arrive, 1 - light.cover
-    around = cv2.GaussianBlur(arrive, (0, 0), _SIGMA_PX)
+        unshadowed = cv2.merge([*(light.radiance - light.foreground + light.blocked)])
+        return picture + _scatter(light, light.shade, light.irradiance, unshadowed, sigmas)
+    layers = light.foreground, light.radiance - light.foreground, light.blocked
+    foreground, background, blocked = (cv2.merge([*layer]) for layer in layers)
+    cover, irradiance, bare = light.cover, light.irradiance, 1 - light.cover
+    mean_irradiance = cv2.GaussianBlur(irradiance, (0, 0), _SIGMA_PX)
     if cover.any():
         # Paths that an object leaves of a pixel's need not sample all lamps equally.
-        some = (cover > 0) & (arrive > 0)
-        usual = around / np.maximum(cv2.GaussianBlur(bare, (0, 0), _SIGMA_PX), _LEAST)
-        even = np.minimum(usual * bare / np.where(some, arrive, 1), _MOST)
-        even = np.where(some, even, np.float32(1))[..., None]
-        behind, blocked = behind * even, blocked * even
+        valid = (cover > 0) & (irradiance > 0)
+        expected = mean_irradiance / np.maximum(cv2.GaussianBlur(bare, (0, 0), _SIGMA_PX), _LEAST)
+        correction = np.minimum(expected * bare / np.where(valid, irradiance, 1), _MOST)
+        correction = np.where(valid, correction, np.float32(1))[..., None]
+        background, blocked = background * correction, blocked * correction
     if light.shade.any():
         # Of the light past defocused objects, whose edges are none of a shadow's.
-        part = cv2.GaussianBlur(light.shade, (0, 0), _SIGMA_PX) / np.maximum(around, _LEAST * around.max())
-        clear = behind + blocked
-        bright = clear[..., 1] + _LEAST
-        planes = cv2.merge([arrive, light.shade, arrive**2 / bright])
-        total, shade, dull = cv2.split(_averaged(planes, _along(part, np.full_like(part, _SOFT_PX))))
+        shaded_share = cv2.GaussianBlur(light.shade, (0, 0), _SIGMA_PX) / np.maximum(
+            mean_irradiance, _LEAST * mean_irradiance.max()
+        )
+        unshadowed = background + blocked
+        brightness = unshadowed[..., 1] + _LEAST
+        planes = cv2.merge([irradiance, light.shade, irradiance**2 / brightness])
+        total, shade, dull = cv2.split(
+            _average_along(planes, _edge_vectors(shaded_share, np.full_like(shaded_share, _SOFT_PX)))
+        )
         # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
-        most = np.minimum(4 * total * arrive / np.maximum(dull * bright, _LEAST), 1)
-        gain = most * (light.shade / np.maximum(arrive, _LEAST) - shade / np.maximum(total, _LEAST))
-        scattered = _scattered(light, shade, total, most[..., None] * clear, sigmas)
-        behind = np.maximum(behind + gain[..., None] * clear + scattered, 0)
-    picture = np.ascontiguousarray(near + behind)
+        limit = np.minimum(4 * total * irradiance / np.maximum(dull * brightness, _LEAST), 1)
+        gain = limit * (light.shade / np.maximum(irradiance, _LEAST) - shade / np.maximum(total, _LEAST))
+        scattered = _scatter(light, shade, total, limit[..., None] * unshadowed, sigmas)
+        background = np.maximum(background + gain[..., None] * unshadowed + scattered, 0)
+    picture = np.ascontiguousarray(foreground + background)
     if cover.any():
         reach = int((light.radius / np.maximum(cover, _LEAST)).max()) + _REACH
         share = cv2.blur(cover, (2 * reach + 1,) * 2)
@@ -70,66 +74,66 @@ def soften(light: Light, spp: int, mm_per_px: float = np.inf) -> Map:
         # Object by object: scenery at opposite borders would have a box as large as the picture.
         count, label, boxes, _ = cv2.connectedComponentsWithStats((share > _LEAST).astype(np.uint8))
         for k in range(1, count):
-            x, y, wide, high = boxes[k, :4].tolist()
-            box = np.s_[y : y + high, x : x + wide]
-            filtered = _covered(near[box], behind[box], cover[box], radius[box])
-            picture[box] = np.where((label[box] == k)[..., None], filtered, picture[box])
-    return _outlined(picture, light.steel + light.cover)
+            x, y, width, height = boxes[k, :4].tolist()
+            box = np.s_[y : y + height, x : x + width]
+            composite = _composite(foreground[box], background[box], cover[box], radius[box])
+            picture[box] = np.where((label[box] == k)[..., None], composite, picture[box])
+    return _smooth_outline(picture, light.steel + light.cover)
 
 
-def _outlined(picture: Map, steel: Map) -> Map:
+def _smooth_outline(picture: Map, steel: Map) -> Map:
     """The picture (H, W, 3), changed in place: averaged along the outline of a share (H, W) of steel.
 
     A few paths sample the thin shadow beside an outline in some pixels and miss it in the next: it would be a
     row of beads.
     """
-    partial = ((steel > 0) & (steel < 1 - _LEAST)).astype(np.uint8)
-    if not partial.any():
+    border = ((steel > 0) & (steel < 1 - _LEAST)).astype(np.uint8)
+    if not border.any():
         return picture
-    x, y, wide, high = cv2.boundingRect(partial)
+    x, y, width, height = cv2.boundingRect(border)
     # As far around as the smoothing and the averages reach.
-    box = np.s_[max(y - _MARGIN, 0) : y + high + _MARGIN, max(x - _MARGIN, 0) : x + wide + _MARGIN]
+    box = np.s_[max(y - _MARGIN, 0) : y + height + _MARGIN, max(x - _MARGIN, 0) : x + width + _MARGIN]
     share = np.ascontiguousarray(steel[box])
-    along = _along(cv2.GaussianBlur(share, (0, 0), _OUTLINE_PX), np.zeros_like(share))
-    along *= cv2.dilate(partial[box], np.ones((3, 3), np.uint8))
-    picture[box] = _averaged(np.ascontiguousarray(picture[box]), along)
+    vectors = _edge_vectors(cv2.GaussianBlur(share, (0, 0), _OUTLINE_PX), np.zeros_like(share))
+    vectors *= cv2.dilate(border[box], np.ones((3, 3), np.uint8))
+    picture[box] = _average_along(np.ascontiguousarray(picture[box]), vectors)
     return picture
 
 
-def _scattered(light: Light, shade: Map, arrive: Map, clear: Map, sigmas: tuple[float, ...]) -> Map:
+def _scatter(light: Light, shade: Map, irradiance: Map, unshadowed: Map, sigmas: tuple[float, ...]) -> Map:
     """Radiance (H, W, 3) that shadows gain, or light beside them loses, by the blur of irradiance in tissue.
 
-    `shade` of the irradiance `arrive` (H, W) is blocked; without it the radiance is `clear` (H, W, 3);
+    `shade` of the `irradiance` (H, W) is blocked; without it the radiance is `unshadowed` (H, W, 3);
     `sigmas`: of the blur in each channel, px. Steel neither gains nor gives.
     """
     if not any(sigmas):
-        return np.zeros_like(clear)
+        return np.zeros_like(unshadowed)
     tissue = (light.steel == 0).astype(np.float32)
-    both = cv2.merge([shade * tissue, arrive * tissue])
-    small = cv2.resize(both, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    sharp = shade / np.maximum(arrive, _LEAST)
+    planes = cv2.merge([shade * tissue, irradiance * tissue])
+    half_planes = cv2.resize(planes, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    shaded_share = shade / np.maximum(irradiance, _LEAST)
     # Where steel covers a part of a pixel, what is blocked there is the tissue's.
     y, x = np.nonzero((light.steel > 0) & (light.steel < 1 - light.cover - _LEAST))
-    gained = []
+    gains = []
     for channel, sigma in enumerate(sigmas):
-        blurred = cv2.GaussianBlur(small, (0, 0), 0.5 * sigma)
-        part = blurred[..., 0] / np.maximum(blurred[..., 1], _LEAST)
-        part = cv2.resize(part, sharp.shape[::-1])
-        plane = (sharp - part) * clear[..., channel] * tissue
-        plane[y, x] = (1 - part[y, x]) * light.blocked[channel, y, x]
-        gained.append(plane)
-    return np.asarray(cv2.merge(gained), np.float32)
+        blurred = cv2.GaussianBlur(half_planes, (0, 0), 0.5 * sigma)
+        blurred_share = blurred[..., 0] / np.maximum(blurred[..., 1], _LEAST)
+        blurred_share = cv2.resize(blurred_share, shaded_share.shape[::-1])
+        plane = (shaded_share - blurred_share) * unshadowed[..., channel] * tissue
+        plane[y, x] = (1 - blurred_share[y, x]) * light.blocked[channel, y, x]
+        gains.append(plane)
+    return np.asarray(cv2.merge(gains), np.float32)
 
 
-def _covered(near: Map, behind: Map, cover: Map, radius: Map) -> Map:
-    """Picture (H, W, 3) of defocused objects' light and share over the light `behind`."""
-    planes = _smooth(np.dstack([near, behind, cover]), radius)
+def _composite(foreground: Map, background: Map, cover: Map, radius: Map) -> Map:
+    """Picture (H, W, 3) of defocused objects' light and share over the light `background`."""
+    planes = _smooth(np.dstack([foreground, background, cover]), radius)
     # Highlights on an object run along its edge as well.
-    planes = _averaged(planes, _along(planes[..., 6] + planes[..., 1], radius))
+    planes = _average_along(planes, _edge_vectors(planes[..., 6] + planes[..., 1], radius))
     gap = 1 - planes[..., 6:]
-    back = behind + np.float32(0.05) * planes[..., 3:6]
-    back /= (1 - cover)[..., None] + np.float32(0.05) * gap + _LEAST
-    return np.where(gap < 1, planes[..., :3] + gap * back, behind)
+    visible_background = background + np.float32(0.05) * planes[..., 3:6]
+    visible_background /= (1 - cover)[..., None] + np.float32(0.05) * gap + _LEAST
+    return np.where(gap < 1, planes[..., :3] + gap * visible_background, background)
 
 
 def _smooth(planes: Map, radius: Map) -> Map:
@@ -137,16 +141,16 @@ def _smooth(planes: Map, radius: Map) -> Map:
     sizes = [1, 3, 7, 15, 31, 63]
     variances = [(size**2 - 1) / 6 for size in sizes]
     level = np.interp((_ACROSS * radius) ** 2, variances, range(len(sizes))).astype(np.float32)
-    found = np.zeros_like(planes)
+    smoothed = np.zeros_like(planes)
     for k in range(int(np.ceil(level.max())) + 1):
         size = sizes[k], sizes[k]
         mean = planes if k == 0 else cv2.blur(cv2.blur(planes, size), size)
-        near = np.abs(level - k) < 1
-        found[near] += (1 - np.abs(level[near] - k))[:, None] * mean[near]
-    return found
+        close_pixels = np.abs(level - k) < 1
+        smoothed[close_pixels] += (1 - np.abs(level[close_pixels] - k))[:, None] * mean[close_pixels]
+    return smoothed
 
 
-def _along(share: Map, radius: Map) -> Map:
+def _edge_vectors(share: Map, radius: Map) -> Map:
     """Vectors (2, H, W) px along the edges of a smooth share (H, W), of the length to average over; 0
     elsewhere. `radius`: (H, W) px of the circle of confusion.
 
@@ -154,38 +158,38 @@ def _along(share: Map, radius: Map) -> Map:
     """
     x, y = cv2.Sobel(share, -1, 1, 0, scale=0.125), cv2.Sobel(share, -1, 0, 1, scale=0.125)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _SIGMA_PX) for product in (x * x, x * y, y * y))
-    along = np.zeros((2, *share.shape), np.float32)
-    whole = xx + yy
-    y, x = np.nonzero(whole > _FLAT / (1 + radius) ** 2)
-    radius, whole, xx, xy, yy = (plane[y, x] for plane in (radius, whole, xx, xy, yy))
+    vectors = np.zeros((2, *share.shape), np.float32)
+    trace = xx + yy
+    y, x = np.nonzero(trace > _FLAT / (1 + radius) ** 2)
+    radius, trace, xx, xy, yy = (plane[y, x] for plane in (radius, trace, xx, xy, yy))
     # The average ends at the picture's border.
     border = np.minimum(np.minimum(x, share.shape[1] - 1 - x), np.minimum(y, share.shape[0] - 1 - y))
-    reach = np.minimum(_REACH + _ALONG * radius, border) * np.hypot(xx - yy, 2 * xy) / whole
+    reach = np.minimum(_REACH + _ALONG * radius, border) * np.hypot(xx - yy, 2 * xy) / trace
     turn = 0.5 * np.arctan2(2 * xy, xx - yy)
-    along[:, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
-    return along
+    vectors[:, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
+    return vectors
 
 
-def _averaged(planes: Map, along: Map) -> Map:
+def _average_along(planes: Map, vectors: Map) -> Map:
     """Planes (H, W, C) averaged over vectors (2, H, W) px and their opposites."""
-    found = planes.copy()
-    _average(planes, along, np.empty(planes.shape[2], np.float32), found)
-    return found
+    out = planes.copy()
+    _average_planes(planes, vectors, np.empty(planes.shape[2], np.float32), out)
+    return out
 
 
 @argument_types("f4[:,:,::1], f4[:,:,::1], f4[::1], f4[:,:,::1]")
 @vectorised
-def _average(planes: Map, along: Map, total: Map, found: Map) -> None:
+def _average_planes(planes: Map, vectors: Map, total: Map, out: Map) -> None:
     height, width, count = planes.shape
     for y in range(height):
         for x in range(width):
-            if along[0, y, x] == 0 and along[1, y, x] == 0:
+            if vectors[0, y, x] == 0 and vectors[1, y, x] == 0:
                 continue
             for k in range(count):
                 total[k] = 0
             for step in range(-_STEPS, _STEPS + 1):
-                u = min(max(x + along[0, y, x] * step / _STEPS, 0), width - 1.001)
-                v = min(max(y + along[1, y, x] * step / _STEPS, 0), height - 1.001)
+                u = min(max(x + vectors[0, y, x] * step / _STEPS, 0), width - 1.001)
+                v = min(max(y + vectors[1, y, x] * step / _STEPS, 0), height - 1.001)
                 left, top = int(u), int(v)
                 for j in range(2):
                     for i in range(2):
@@ -193,4 +197,4 @@ def _average(planes: Map, along: Map, total: Map, found: Map) -> None:
                         for k in range(count):
                             total[k] += np.float32(weight) * planes[top + j, left + i, k]
             for k in range(count):
-                found[y, x, k] = total[k] / np.float32((_STEPS + 1) ** 2)
+                out[y, x, k] = total[k] / np.float32((_STEPS + 1) ** 2)

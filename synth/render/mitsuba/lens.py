@@ -60,9 +60,9 @@ class Scalar:
         rows = (np.arange(height * self._fine) + 0.5) * step - 0.5
         x, y = np.meshgrid((columns - camera.K[0, 2]) / fx, (rows - camera.K[1, 2]) / fy)
         flat = cameras.undistort(np.stack([x.ravel(), y.ravel()], axis=1), camera.distortion)
-        at = (flat * fx * self._fine).reshape(*x.shape, 2)
-        half = np.ceil(np.abs(at).max(axis=(0, 1))).astype(int) + 1
-        self._at = (at + half - 0.5).astype(np.float32)
+        positions = (flat * fx * self._fine).reshape(*x.shape, 2)
+        half = np.ceil(np.abs(positions).max(axis=(0, 1))).astype(int) + 1
+        self._positions = (positions + half - 0.5).astype(np.float32)
         self._film = _film(*(2 * half).tolist())
         self._fov = float(np.rad2deg(2 * np.arctan(self._film["width"] / (2 * fx * self._fine))))
 
@@ -70,9 +70,9 @@ class Scalar:
         """Moves the lens to the camera's pose."""
         import mitsuba as mi
 
-        if (given := [*camera.K.ravel(), *camera.distortion]) != self._fitted:
+        if (intrinsics := [*camera.K.ravel(), *camera.distortion]) != self._fitted:
             self._fit(camera)
-            self._fitted = given
+            self._fitted = intrinsics
         to_world = np.eye(4)
         # Mitsuba's cameras have x to the left and y up.
         to_world[:3, :3] = (camera.rotation * np.array([[-1.0], [-1.0], [1.0]])).T
@@ -82,26 +82,30 @@ class Scalar:
             lens |= {"type": "thinlens", "aperture_radius": camera.aperture_mm}
             lens |= {"focus_distance": camera.focus_mm}
         sampler = {"type": "multijitter", "sample_count": self.spp}
-        placed = {"to_world": mi.ScalarTransform4f(to_world.tolist()), "film": self._film, "sampler": sampler}
-        self.sensor = mi.load_dict(lens | placed)
+        options = {
+            "to_world": mi.ScalarTransform4f(to_world.tolist()),
+            "film": self._film,
+            "sampler": sampler,
+        }
+        self.sensor = mi.load_dict(lens | options)
 
     def develop(self, image: Map) -> Map:
         """The recorded picture (H, W, 3) of a larger, finer film."""
-        fine = cv2.remap(image, self._at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        fine = cv2.remap(image, self._positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = (fine.shape[1] // self._fine, fine.shape[0] // self._fine)
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _film(width: int, height: int) -> dict[str, Any]:
     # A box filter does not mix pixels, so sums have one order on any number of threads: the same bytes.
-    how = {"rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"}
-    return {"type": "hdrfilm", "width": width, "height": height, **how}
+    options = {"rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"}
+    return {"type": "hdrfilm", "width": width, "height": height, **options}
 
 
 _NAMES = "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
 
 
-def _undistorted(goal_x: Any, goal_y: Any, v: dict[str, Any], rounds: int) -> tuple[Any, Any]:
+def _undistort(goal_x: Any, goal_y: Any, v: dict[str, Any], rounds: int) -> tuple[Any, Any]:
     """Normalised coordinates that distortion coefficients `v` take to the goal."""
     x, y = goal_x, goal_y
     for _ in range(rounds):  # each reduces the error by the size of the distortion
@@ -118,15 +122,15 @@ def _coefficients(camera: Camera) -> dict[str, float]:
     return dict(zip(_NAMES, [*camera.distortion.tolist(), 0.0, 0.0, 0.0], strict=False))
 
 
-def _rounds(camera: Camera) -> int:
-    """Rounds of `_undistorted` after which it is off by less than 0.01 px, on a grid over the picture."""
+def _count_rounds(camera: Camera) -> int:
+    """Rounds of `_undistort` after which it is off by less than 0.01 px, on a grid over the picture."""
     axis = np.linspace(0, 1, 17)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * camera.size - 0.5
     x, y = (grid - camera.K[:2, 2]).T / np.diag(camera.K)[:2, None]
     exact = cameras.undistort(np.stack([x, y], axis=1), camera.distortion).T
     for rounds in range(6, 120, 6):
-        found = np.stack(_undistorted(x, y, _coefficients(camera), rounds))
-        if not np.abs(found - exact).max() * camera.K[0, 0] > 0.01:
+        points = np.stack(_undistort(x, y, _coefficients(camera), rounds))
+        if not np.abs(points - exact).max() * camera.K[0, 0] > 0.01:
             return rounds
     raise UserError("the lens distorts too strongly for compiled variants: set render.variant=scalar_rgb")
 
@@ -148,8 +152,8 @@ def _register(variant: str) -> None:
 
         def place(self, camera: Camera) -> None:
             """Sets pose and intrinsics."""
-            if (lens := [*camera.K.ravel(), *camera.distortion]) != self.fitted:  # not for every frame
-                self.rounds, self.fitted = _rounds(camera), lens
+            if (intrinsics := [*camera.K.ravel(), *camera.distortion]) != self.fitted:  # not for every frame
+                self.rounds, self.fitted = _count_rounds(camera), intrinsics
 
             # As data: a literal in the code would compile it anew for every scene.
             def data(values: Any) -> list[Any]:
@@ -169,12 +173,12 @@ def _register(variant: str) -> None:
             v = self.v
             x = (position.x * self.width - 0.5 - v["cx"]) / v["fx"]
             y = (position.y * self.height - 0.5 - v["cy"]) / v["fy"]
-            x, y = _undistorted(x, y, v, self.rounds)
+            x, y = _undistort(x, y, v, self.rounds)
             lens = mi.warp.square_to_uniform_disk_concentric(aperture) * v["aperture"]
             right, down, forward = self.rows
             origin = self.centre + right * lens.x + down * lens.y
-            sharp = self.centre + (right * x + down * y + forward) * v["focus"]
-            ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(sharp - origin)), time)
+            focus_point = self.centre + (right * x + down * y + forward) * v["focus"]
+            ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(focus_point - origin)), time)
             return mi.RayDifferential3f(ray), mi.Color3f(1.0)
 
         def bbox(self) -> Any:

@@ -40,61 +40,65 @@ def paint(pattern: Pattern, pixels: int, extent_mm: float) -> Coat:
     rng = np.random.default_rng(pattern.seed)
     level = np.clip(_levels(pattern, rng, pixels, extent_mm), 0, 1).astype(np.float32)
     low, middle, high = (np.asarray(colour, np.float32) for colour in pattern.colours)
-    part = 2 * level[..., None]
-    albedo = over(over(low, middle, np.minimum(part, 1)), high, np.maximum(part - 1, 0))
+    doubled = 2 * level[..., None]
+    albedo = over(over(low, middle, np.minimum(doubled, 1)), high, np.maximum(doubled - 1, 0))
     albedo *= 1 + _GRAIN * noise.fractal(rng, pixels, extent_mm, 0.05 * extent_mm, 1.0)[..., None]
     height = np.float32(pattern.relief * pattern.size_mm) * level
-    bent = normals(noise.blur(height, 1.5 * extent_mm / pixels, extent_mm), extent_mm)
+    normal_map = normals(noise.blur(height, 1.5 * extent_mm / pixels, extent_mm), extent_mm)
     dry = pattern.dry + 0.2 * noise.fractal(rng, _DRY_PX, extent_mm, 0.2 * extent_mm, 1.5)
-    return Coat(np.clip(albedo, 0.01, 0.95).astype(np.float32), bent, np.clip(dry, 0, 1).astype(np.float32))
+    return Coat(
+        np.clip(albedo, 0.01, 0.95).astype(np.float32), normal_map, np.clip(dry, 0, 1).astype(np.float32)
+    )
 
 
-def tinted(albedo: Map, tint: Colour, share: float) -> Map:
+def apply_tint(albedo: Map, tint: Colour, share: float) -> Map:
     """An albedo (n, n, 3) with a share of its colour replaced by a tint of the same relative brightness."""
-    bright = albedo.mean(axis=2, keepdims=True) / albedo.mean()
-    return np.asarray(np.clip((1 - share) * albedo + share * bright * tint, 0.01, 0.95), np.float32)
+    brightness = albedo.mean(axis=2, keepdims=True) / albedo.mean()
+    return np.asarray(np.clip((1 - share) * albedo + share * brightness * tint, 0.01, 0.95), np.float32)
 
 
 def _levels(pattern: Pattern, rng: np.random.Generator, pixels: int, extent_mm: float) -> Map:
     """Levels (n, n), about 0 to 1, of a kind of pattern."""
     kind, size, ground = pattern.kind, pattern.size_mm, (pixels, extent_mm)
-    place, sharp = noise.centres(*ground) / size, pixels * size / extent_mm  # in elements; pixels in each
+    place, cell_px = noise.centres(*ground) / size, pixels * size / extent_mm  # in elements; pixels in each
     if kind == "spectrum":
         return np.asarray(0.5 + 0.28 * noise.fractal(rng, *ground, size, pattern.slope))
     if kind == "speckle":  # blots about half a wavelength wide, as sprayed for digital image correlation
         return step(4 * noise.band(rng, *ground, 2 * size, 0.3))
     if kind == "silicone":  # even, with few bubbles
         bubbles = 0.5 * (noise.band(rng, *ground, 0.3 * size, 0.3) > 3.2)
-        wide = 0.5 + 0.05 * noise.fractal(rng, *ground, 4 * size, 2.5)
-        return noise.blur((wide + bubbles).astype(np.float32), 0.3, extent_mm)
+        waves = 0.5 + 0.05 * noise.fractal(rng, *ground, 4 * size, 2.5)
+        return noise.blur((waves + bubbles).astype(np.float32), 0.3, extent_mm)
     if kind == "weave":
-        wave, worn = np.sin(2 * np.pi * place), noise.fractal(rng, *ground, 0.3 * extent_mm, 2.0)
-        return np.asarray(0.5 + 0.3 * wave * wave[:, None] + 0.1 * worn)
+        wave, wear = np.sin(2 * np.pi * place), noise.fractal(rng, *ground, 0.3 * extent_mm, 2.0)
+        return np.asarray(0.5 + 0.3 * wave * wave[:, None] + 0.1 * wear)
     if kind == "streaks":  # of brushed metal, of wood
         fine = noise.fractal(rng, *ground, size, pattern.slope)[:, : max(pixels // 16, 8)]
         return np.asarray(0.5 + 0.22 * cv2.resize(fine, (pixels, pixels), interpolation=cv2.INTER_CUBIC))
     if kind == "lines":  # of paper, in half of them squares
-        line = step((0.06 - np.abs(place - np.rint(place))) * sharp)
+        line = step((0.06 - np.abs(place - np.rint(place))) * cell_px)
         return np.asarray(1 - np.maximum(line[:, None], line * bool(rng.integers(2))))
     if kind == "dots":
         cell = np.floor(place - place[0]).astype(int)
         count = int(cell[-1]) + 1
         inside = place - place[0] - cell - 0.5
-        aside = 0.08 * pattern.slope * rng.uniform(-1, 1, (2, count, count))
+        offsets = 0.08 * pattern.slope * rng.uniform(-1, 1, (2, count, count))
         x, y = np.meshgrid(cell, cell)
-        away = np.hypot(inside - aside[0][y, x], inside[:, None] - aside[1][y, x])
-        return np.asarray(step((0.27 - away) * sharp) * rng.uniform(0.4, 1, (count, count))[y, x])
-    at = rng.integers(pixels, size=(2, max(int((extent_mm / size) ** 2), 4)))
-    off = np.ones(ground[:1] * 2, np.uint8)
-    off[at[0], at[1]] = 0
-    away, of = cv2.distanceTransformWithLabels(off, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    away = away / np.float32(sharp)
+        distance = np.hypot(inside - offsets[0][y, x], inside[:, None] - offsets[1][y, x])
+        return np.asarray(step((0.27 - distance) * cell_px) * rng.uniform(0.4, 1, (count, count))[y, x])
+    seeds = rng.integers(pixels, size=(2, max(int((extent_mm / size) ** 2), 4)))
+    background = np.ones(ground[:1] * 2, np.uint8)
+    background[seeds[0], seeds[1]] = 0
+    distance, labels = cv2.distanceTransformWithLabels(
+        background, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    distance = distance / np.float32(cell_px)
     if kind == "cells":  # Voronoi's, dark at their borders
-        borders = cv2.morphologyEx(of.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
-        levels = np.where(borders, 0, rng.uniform(0.15, 1, int(of.max()) + 1)[of])
+        borders = cv2.morphologyEx(labels.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
+        levels = np.where(borders, 0, rng.uniform(0.15, 1, int(labels.max()) + 1)[labels])
         return noise.blur(levels.astype(np.float32), 0.7 * extent_mm / pixels, extent_mm)
     if kind == "fat":  # round lobules
         lumps = noise.fractal(rng, *ground, size, 2.0)
-        return np.asarray(np.sqrt(np.clip(1 - (1.3 * away) ** 2, 0, 1)) * (0.85 + 0.1 * lumps))
-    wide = noise.fractal(rng, *ground, 12 * size, 2.0)  # liver: faint lobules
-    return np.asarray(0.5 + 0.12 * wide - 0.25 * np.clip(away, 0, 1))
+        return np.asarray(np.sqrt(np.clip(1 - (1.3 * distance) ** 2, 0, 1)) * (0.85 + 0.1 * lumps))
+    waves = noise.fractal(rng, *ground, 12 * size, 2.0)  # liver: faint lobules
+    return np.asarray(0.5 + 0.12 * waves - 0.25 * np.clip(distance, 0, 1))

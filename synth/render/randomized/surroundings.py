@@ -45,29 +45,37 @@ class Randomization:
     surroundings: Surroundings | None = None  # None: the rim of a craniotomy
 
 
-def sheet(drawn: Surroundings, tissue: Floats, radius_mm: float, width_mm: float, ambient: Floats) -> Body:
+def sheet(
+    surroundings: Surroundings, tissue: Floats, radius_mm: float, width_mm: float, ambient: Floats
+) -> Body:
     """The sheet around an opening of a radius, as wide as `width_mm`.
 
     `tissue`: (V, 3) mm, a square patch around the opening, whose edge it hides; `ambient`: as of `Wet`.
     """
-    angle, power = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False), drawn.corners
-    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    hole = (np.abs(ways / [drawn.longer, 1.0]) ** power).sum(axis=1, keepdims=True) ** (-1 / power)
+    angle, power = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False), surroundings.corners
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    hole = (np.abs(directions / [surroundings.longer, 1.0]) ** power).sum(axis=1, keepdims=True) ** (
+        -1 / power
+    )
     hole = radius_mm * np.minimum(0.92 * hole / hole.min(), 1.2)
-    away = np.concatenate([[0.0, 0.0], width_mm * np.linspace(0, 1, _OUT) ** 2])
-    xy = ((hole + away)[..., None] * ways[:, None]).reshape(-1, 2)
+    distance = np.concatenate([[0.0, 0.0], width_mm * np.linspace(0, 1, _OUT) ** 2])
+    xy = ((hole + distance)[..., None] * directions[:, None]).reshape(-1, 2)
     # Over the paraboloid through the tissue's heights, and not steeper down than it beyond the patch.
     r2, z = (tissue[:, :2] ** 2).sum(axis=1), tissue[:, 2]
     outer = r2 > (0.8 * radius_mm) ** 2
     (bend, top), *_ = np.linalg.lstsq(np.stack([r2, np.ones_like(r2)], 1)[outer], z[outer], rcond=None)
     edge = bend * hole**2 + top + float((z - bend * r2 - top)[outer].max())
-    extent = 2.1 * float((hole + away).max())
-    wave = noise.band(np.random.default_rng(drawn.pattern.seed + 1), 128, extent, 0.8 * radius_mm, 0.6)
+    extent = 2.1 * float((hole + distance).max())
+    wave = noise.band(np.random.default_rng(surroundings.pattern.seed + 1), 128, extent, 0.8 * radius_mm, 0.6)
     folds = np.maximum(noise.sample(wave, xy, extent).reshape(_AROUND, -1) + 1, 0)
-    height = edge + drawn.lip * radius_mm + max(drawn.rise, 2 * min(bend, 0.0) * radius_mm) * away
-    height = height + drawn.folds * radius_mm * folds * np.minimum(away / radius_mm, 1)
+    height = (
+        edge
+        + surroundings.lip * radius_mm
+        + max(surroundings.rise, 2 * min(bend, 0.0) * radius_mm) * distance
+    )
+    height = height + surroundings.folds * radius_mm * folds * np.minimum(distance / radius_mm, 1)
     height[:, :1] = edge - 0.5 * radius_mm  # the hole's wall ends in the tissue
-    pattern = replace(drawn.pattern, size_mm=radius_mm * drawn.pattern.size_mm)
-    coat = Wet(lambda: paint(pattern, _TEXELS, extent), pattern.roughness, _DRY, ambient, drawn.index)
-    faces = grid_faces(_AROUND, len(away), "rows").reshape(-1, 3)
+    pattern = replace(surroundings.pattern, size_mm=radius_mm * surroundings.pattern.size_mm)
+    coat = Wet(lambda: paint(pattern, _TEXELS, extent), pattern.roughness, _DRY, ambient, surroundings.index)
+    faces = grid_faces(_AROUND, len(distance), "rows").reshape(-1, 3)
     return Body(np.column_stack([xy, height.ravel()]), faces, (xy / extent + 0.5).astype(np.float32), coat)

@@ -36,33 +36,33 @@ def join(layout: str) -> list[np.ndarray]:
     if layout == "alternating":
         return 4 * [LEFT, RIGHT]
     axis = int(layout in ("side-by-side", "half-width"))
-    both = np.concatenate([LEFT, RIGHT], axis)
+    picture = np.concatenate([LEFT, RIGHT], axis)
     if layout.startswith("half"):
-        both = both[:, ::2] if axis else both[::2]
-    return 4 * [both]
+        picture = picture[:, ::2] if axis else picture[::2]
+    return 4 * [picture]
 
 
 @pytest.mark.parametrize("layout", ["side-by-side", "top-bottom", "half-width", "half-height", "alternating"])
 def test_two_cameras_in_one_video_are_recognised_and_split(layout: str, tmp_path: Path) -> None:
     source = write(tmp_path / "v.mkv", join(layout))
-    noted = importer_registry.read_source(source).notes
-    assert any(layout in note for note in noted)
+    notes = importer_registry.read_source(source).notes
+    assert any(layout in note for note in notes)
     for order, expected in (("", (LEFT, RIGHT)), (",right-first", (RIGHT, LEFT))):
-        found = importer_registry.read_source(source, layout=layout + order)
-        assert len(found.times_s) == 4 == len(found.second.frame)
-        for got, rgb in zip((found.pictures, found.second.pictures), expected, strict=True):
-            off = np.abs(next(got()).astype(int) - rgb).mean()
-            assert off < (6 if layout.startswith("half") else 1)
+        intake = importer_registry.read_source(source, layout=layout + order)
+        assert len(intake.times_s) == 4 == len(intake.second.frame)
+        for read_pictures, rgb in zip((intake.pictures, intake.second.pictures), expected, strict=True):
+            error = np.abs(next(read_pictures()).astype(int) - rgb).mean()
+            assert error < (6 if layout.startswith("half") else 1)
 
 
 def interleave(layout: str) -> np.ndarray:
-    both, odd = LEFT.copy(), np.indices(LEFT.shape[:2]) % 2 == 1
-    where = {"rows": odd[0], "columns": odd[1], "checkerboard": odd[0] != odd[1]}
+    picture, is_odd = LEFT.copy(), np.indices(LEFT.shape[:2]) % 2 == 1
+    masks = {"rows": is_odd[0], "columns": is_odd[1], "checkerboard": is_odd[0] != is_odd[1]}
     if layout == "anaglyph":
-        both[..., 1:] = RIGHT[..., 1:]
+        picture[..., 1:] = RIGHT[..., 1:]
     else:
-        both[where[layout]] = RIGHT[where[layout]]
-    return both
+        picture[masks[layout]] = RIGHT[masks[layout]]
+    return picture
 
 
 @pytest.mark.parametrize("layout", ["rows", "columns", "checkerboard", "anaglyph"])
@@ -75,9 +75,9 @@ def test_two_cameras_in_lines_or_colours_are_recognised_and_those_in_lines_split
         with pytest.raises(UserError, match="two cameras"):
             importer_registry.read_source(source, layout=layout)
         return
-    found = importer_registry.read_source(source, layout=layout)
-    for got, rgb in ((found.pictures, LEFT), (found.second.pictures, RIGHT)):
-        picture = next(got()).astype(int)
+    intake = importer_registry.read_source(source, layout=layout)
+    for read_pictures, rgb in ((intake.pictures, LEFT), (intake.second.pictures, RIGHT)):
+        picture = next(read_pictures()).astype(int)
         # In place, to a fraction of a pixel.
         assert np.abs(picture - rgb).mean() < 6
         for axis in (0, 1):
@@ -86,17 +86,17 @@ def test_two_cameras_in_lines_or_colours_are_recognised_and_those_in_lines_split
 
 
 def test_interlaced_fields_are_not_taken_for_two_cameras() -> None:
-    moved = [WIDE[:, 8 * k : 8 * k + 640].copy() for k in range(9)]
-    for k, rgb in enumerate(moved):
+    pictures = [WIDE[:, 8 * k : 8 * k + 640].copy() for k in range(9)]
+    for k, rgb in enumerate(pictures):
         rgb[1::2] = WIDE[1::2, 8 * k + 4 : 8 * k + 644]
-    assert find_layout(moved) == ""
+    assert find_layout(pictures) == ""
 
 
 def test_one_camera_is_not_taken_for_two() -> None:
     """Also mirrored, black, half black and periodic pictures."""
     board = np.repeat(255 * (np.add.outer(np.arange(480) // 40, np.arange(640) // 40) % 2)[..., None], 3, 2)
-    mirrored = np.hstack([LEFT, LEFT[:, ::-1]]), np.vstack([LEFT, LEFT[::-1]])
-    for picture in (LEFT, *mirrored, 0 * LEFT, LEFT * (np.arange(640) < 320)[:, None], board):
+    mirror_pairs = np.hstack([LEFT, LEFT[:, ::-1]]), np.vstack([LEFT, LEFT[::-1]])
+    for picture in (LEFT, *mirror_pairs, 0 * LEFT, LEFT * (np.arange(640) < 320)[:, None], board):
         assert find_layout(3 * [picture.astype(np.uint8)]) == ""
 
 
@@ -108,8 +108,8 @@ def test_drawn_stripes_are_not_taken_for_two_cameras(seed: int) -> None:
     turn, period = rng.choice([0, np.pi / 4, np.pi / 2, rng.uniform(0, np.pi)]), rng.uniform(3, 9)
     wave = np.sin(2 * np.pi * (x * np.cos(turn) + y * np.sin(turn)) / period)
     wave = np.sign(wave) if seed % 2 else wave
-    drawn = 128 + 80 * wave[..., None] + rng.normal(0, 3, (192, 256, 3))
-    assert find_layout(3 * [np.clip(drawn, 0, 255).astype(np.uint8)]) == ""
+    picture = 128 + 80 * wave[..., None] + rng.normal(0, 3, (192, 256, 3))
+    assert find_layout(3 * [np.clip(picture, 0, 255).astype(np.uint8)]) == ""
 
 
 FRAMES = [np.roll(LEFT[:240, :320], 6 * k, 1) for k in range(8)]
@@ -119,10 +119,13 @@ FRAMES = [np.roll(LEFT[:240, :320], 6 * k, 1) for k in range(8)]
 def test_times_start_at_0_and_rise_in_order(codec: str, tmp_path: Path) -> None:
     name, codec = codec.split()
     source = write(tmp_path / name, FRAMES, codec, "yuv420p", bf="2")
-    got = list(video.read_video(source))
-    assert [one.time_s for one in got] == pytest.approx(np.arange(8) / 25, abs=1e-6)
-    shown = [np.argmin([np.abs(one.rgb - frame.astype(int)).mean() for frame in FRAMES]) for one in got]
-    assert shown == [*range(8)]
+    pictures = list(video.read_video(source))
+    assert [picture.time_s for picture in pictures] == pytest.approx(np.arange(8) / 25, abs=1e-6)
+    indices = [
+        np.argmin([np.abs(picture.rgb - frame.astype(int)).mean() for frame in FRAMES])
+        for picture in pictures
+    ]
+    assert indices == [*range(8)]
 
 
 @pytest.mark.parametrize("s", [1, -1])
@@ -132,22 +135,22 @@ def test_all_orientations_of_a_display_matrix(s: int, t: int, turned: bool, tmp_
     a, b, c, d = (0, s, t, 0) if turned else (s, 0, 0, t)
     source = write(tmp_path / "a.mp4", [LEFT], "libx264", "yuv444p")
     data = bytearray(source.read_bytes())
-    at = data.index(b"tkhd") + 44
+    offset = data.index(b"tkhd") + 44
     # The track header's display matrix [ISO 14496-12, 8.3.2].
-    data[at : at + 36] = struct.pack(">9i", *(v << 16 for v in (a, b, 0, c, d, 0, 0, 0, 1 << 14)))
+    data[offset : offset + 36] = struct.pack(">9i", *(v << 16 for v in (a, b, 0, c, d, 0, 0, 0, 1 << 14)))
     source.write_bytes(data)
-    got = next(video.read_video(source)).rgb.astype(int)
-    assert got.shape[:2] == LEFT.shape[:2][:: -1 if turned else 1]
+    picture = next(video.read_video(source)).rgb.astype(int)
+    assert picture.shape[:2] == LEFT.shape[:2][:: -1 if turned else 1]
     y, x = np.mgrid[: LEFT.shape[0], : LEFT.shape[1]]
     across, down = a * x + c * y, b * x + d * y
-    assert np.abs(got[down - down.min(), across - across.min()] - LEFT).mean() < 6
+    assert np.abs(picture[down - down.min(), across - across.min()] - LEFT).mean() < 6
 
 
 def test_stacks_bits_numbers_and_hidden_files(tmp_path: Path) -> None:
     cv2.imwritemulti(str(tmp_path / "s.tif"), [frame.astype(np.uint16) * 16 for frame in FRAMES])
     (tmp_path / "._s.tif").write_bytes(b"\0\5\x16\7" + bytes(100))
-    found = importer_registry.read_source(tmp_path, {"fps": "10"})
-    assert np.array_equal([one[..., ::-1] for one in found.pictures()], FRAMES)
+    intake = importer_registry.read_source(tmp_path, {"fps": "10"})
+    assert np.array_equal([picture[..., ::-1] for picture in intake.pictures()], FRAMES)
     pngs = tmp_path / "p"
     pngs.mkdir()
     for k in (0, 1, 5):
@@ -171,11 +174,11 @@ def test_tables_of_forces(tmp_path: Path) -> None:
         "t,fx,fy,fz\n1700000000000000,1,2,3\n1700000000100000,1,2,3",
     ):
         (tmp_path / "f.csv").write_text(text, "utf-16")
-        found = importer_registry.read_source(
+        intake = importer_registry.read_source(
             tmp_path / "v.npy", {"fps": "10", "force": str(tmp_path / "f.csv")}
         )
-        assert found.force_s - found.force_s[0] == pytest.approx([0, 0.1], abs=1e-6)
-        assert found.force.tolist() == 2 * [[1, 2, 3]]
+        assert intake.force_s - intake.force_s[0] == pytest.approx([0, 0.1], abs=1e-6)
+        assert intake.force.tolist() == 2 * [[1, 2, 3]]
     (tmp_path / "f.csv").write_text("t,fx\nnoon,1\n")
     with pytest.raises(UserError, match=":2:"):
         csv_table.read_csv(tmp_path / "f.csv", ("t",))
@@ -183,9 +186,9 @@ def test_tables_of_forces(tmp_path: Path) -> None:
 
 def mosaic(rgb: np.ndarray) -> np.ndarray:
     """(H, W) as of a sensor with red in the first pixel and blue in the second one of the second row."""
-    out = rgb[..., 1].copy()
-    out[::2, ::2], out[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
-    return out
+    picture = rgb[..., 1].copy()
+    picture[::2, ::2], picture[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
+    return picture
 
 
 class Message:
@@ -205,5 +208,5 @@ class Message:
 )
 def test_pictures_of_bags(encoding: str, make: Callable[[np.ndarray], np.ndarray]) -> None:
     rgb = np.ascontiguousarray(FRAMES[0])
-    got = rosbag._picture(Path("bag"), Message(encoding, np.ascontiguousarray(make(rgb))))
-    assert np.abs(got.astype(int) - rgb).mean() < 8
+    picture = rosbag._picture(Path("bag"), Message(encoding, np.ascontiguousarray(make(rgb))))
+    assert np.abs(picture.astype(int) - rgb).mean() < 8

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import run
-from fake_recording import Maker, scored
+from fake_recording import Maker, score_recording
 from igs_sequence import write_igs
 
 from bench.cli import app
@@ -36,15 +36,15 @@ def test_pictures_come_from_the_video_beside_it(local: bool, tmp_path: Path) -> 
     film(tmp_path / "trial.mp4")
     invalid = {3: "Force", 5: "TipToWorldTransform"}
     source = write_igs(tmp_path / "a.igs.mha", TIMES, FORCE, "C:\\data\\trial.mp4", invalid, local=local)
-    found = importer_registry.read_source(source)
-    assert found.times_s == pytest.approx(TIMES, abs=1e-6)
-    assert [int(picture.mean()) // 8 for picture in found.pictures()] == [*range(N)]
-    np.testing.assert_allclose(found.force, np.delete(FORCE, 3, 0), atol=1e-6)
-    pose = found.poses["TipToWorldTransform"]
+    intake = importer_registry.read_source(source)
+    assert intake.times_s == pytest.approx(TIMES, abs=1e-6)
+    assert [int(picture.mean()) // 8 for picture in intake.pictures()] == [*range(N)]
+    np.testing.assert_allclose(intake.force, np.delete(FORCE, 3, 0), atol=1e-6)
+    pose = intake.poses["TipToWorldTransform"]
     assert np.isnan(pose[5]).all()
     assert pose[6, 0, 3] == pytest.approx(6)
     # The bias is said.
-    assert any("free_s" in note for note in found.notes)
+    assert any("free_s" in note for note in intake.notes)
     run(app, "import", source, "-o", tmp_path / "rec", "--scale", 0.1)
     recording = open_recording(tmp_path / "rec")
     assert [frame.time_s for frame in recording.frames()] == pytest.approx(TIMES, abs=1e-6)
@@ -66,9 +66,9 @@ def test_a_video_of_a_few_pictures_more_or_fewer_is_cut_to_the_frames(spare: int
 
 def test_a_sequence_is_a_table_of_forces_too(tmp_path: Path) -> None:
     video, source = film(tmp_path / "v.mp4"), write_igs(tmp_path / "a.mha", TIMES, FORCE, "v.mp4")
-    found = importer_registry.read_source(video, {"force": str(source)})
-    np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
-    np.testing.assert_allclose(found.force_s, TIMES, atol=1e-6)
+    intake = importer_registry.read_source(video, {"force": str(source)})
+    np.testing.assert_allclose(intake.force, FORCE, atol=1e-6)
+    np.testing.assert_allclose(intake.force_s, TIMES, atol=1e-6)
 
 
 def test_what_it_lacks_is_named(tmp_path: Path) -> None:
@@ -97,10 +97,10 @@ def test_six_numbers_of_force_with_pictures_of_which_some_are_invalid(tmp_path: 
     pytest.importorskip("SimpleITK")
     pixels = np.repeat(8 * np.arange(N, dtype=np.uint8), 16 * 24).reshape(N, 16, 24)
     source = write_igs(tmp_path / "a.mha", TIMES, FORCE, "", {2: "Image"}, pixels=pixels)
-    found = importer_registry.read_source(source)
-    assert found.times_s == pytest.approx(np.delete(TIMES, 2), abs=1e-6)
-    assert [int(picture.mean()) // 8 for picture in found.pictures()] == [0, 1, *range(3, N)]
-    np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
+    intake = importer_registry.read_source(source)
+    assert intake.times_s == pytest.approx(np.delete(TIMES, 2), abs=1e-6)
+    assert [int(picture.mean()) // 8 for picture in intake.pictures()] == [0, 1, *range(3, N)]
+    np.testing.assert_allclose(intake.force, FORCE, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -117,6 +117,7 @@ def test_a_recording_in_that_layout_is_scored_as_its_original(make: Maker, tmp_p
     run(app, "import", source, "-o", tmp_path / "rec", "--scale", 0.2)
     shutil.copy(original / "meta.yaml", tmp_path / "rec")
     ours, theirs = (
-        scored(folder, backend="dis").methods["bump"].size_mn for folder in (tmp_path / "rec", original)
+        score_recording(folder, backend="dis").methods["bump"].size_mn
+        for folder in (tmp_path / "rec", original)
     )
     np.testing.assert_allclose(ours, theirs, atol=0.02 * np.nanmax(theirs))

@@ -15,7 +15,7 @@ from bench.importers import importer_registry
 from bench.importers.import_formats import IMPORTERS
 from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
-from tests.bench.importers.test_stereo_bag import writing
+from tests.bench.importers.test_stereo_bag import open_bag
 
 TIMES = np.array([0.0, 0.11, 0.19, 0.3])
 FORCE = np.array([[0.0, 0, 0], [0.1, 0, -0.2], [0.2, 0.1, 0], [0.0, 0, 0.05]])
@@ -56,9 +56,9 @@ def hdf5(path: Path) -> Path:
 LATE_S = 1e6  # offset of the bag's own clock
 
 
-def mcap(path: Path, unstamped: str = "") -> Path:
-    """A ROS 2 bag folder; the topic `unstamped` has no times of its own."""
-    with writing(path) as (kind, put):
+def mcap(path: Path, unstamped_topic: str = "") -> Path:
+    """A ROS 2 bag folder; the topic `unstamped_topic` has no times of its own."""
+    with open_bag(path) as (kind, put):
         vector = kind["geometry_msgs/msg/Vector3"]
         for time_s, picture, newtons in zip(TIMES, footage(), FORCE, strict=True):
             bgr = np.ascontiguousarray(picture[..., ::-1]).ravel()
@@ -67,7 +67,7 @@ def mcap(path: Path, unstamped: str = "") -> Path:
                 ("/camera", "sensor_msgs/msg/Image", (12, 16, "bgr8", 0, 48, bgr)),
                 ("/ft", "geometry_msgs/msg/WrenchStamped", (force,)),
             ):
-                put(topic, name, LATE_S + time_s, *values, stamp_s=0 if topic == unstamped else time_s)
+                put(topic, name, LATE_S + time_s, *values, stamp_s=0 if topic == unstamped_topic else time_s)
             put("/tip", "geometry_msgs/msg/Point", LATE_S + time_s, 1.0, 2.0, 3.0)
     return path
 
@@ -84,16 +84,16 @@ def test_imported_data_equal_the_source(
     recording = open_recording(out)
     pictures = list(recording.frames())
     assert np.array([p.time_s for p in pictures]) == pytest.approx(TIMES, abs=1e-6)
-    got = np.stack([p.rgb for p in pictures]).astype(int)
-    assert np.abs(got - footage()).max() <= 3  # RGB to YUV and back
+    rgb = np.stack([p.rgb for p in pictures]).astype(int)
+    assert np.abs(rgb - footage()).max() <= 3  # RGB to YUV and back
     assert recording.force.force_mn == pytest.approx(1000 * FORCE, abs=1e-6)
 
 
 def test_the_bags_clock_is_used_only_for_topics_without_stamps(tmp_path: Path) -> None:
     """A single zero stamp, as the first of a simulated clock, is valid."""
-    found = importer_registry.read_source(mcap(tmp_path / "bag", unstamped="/ft"))
-    assert found.times_s == pytest.approx(TIMES)
-    assert found.force_s == pytest.approx(LATE_S + TIMES)
+    intake = importer_registry.read_source(mcap(tmp_path / "bag", unstamped_topic="/ft"))
+    assert intake.times_s == pytest.approx(TIMES)
+    assert intake.force_s == pytest.approx(LATE_S + TIMES)
 
 
 def write_nonsense(path: Path) -> Path:
@@ -127,8 +127,8 @@ def test_a_format_of_another_package_is_read_by_its_ending(
         return importer_registry.Intake(np.arange(3) / 25, lambda: iter(pictures)) if not use else None
 
     IMPORTERS.add("xyz", read_xyz)
-    found = importer_registry.read_source(write_nonsense(tmp_path / "a.XYZ"))
-    np.testing.assert_array_equal(np.stack(list(found.pictures())), pictures)
+    intake = importer_registry.read_source(write_nonsense(tmp_path / "a.XYZ"))
+    np.testing.assert_array_equal(np.stack(list(intake.pictures())), pictures)
     with pytest.raises(UserError, match="xyz"):
         importer_registry.read_source(tmp_path / "a.XYZ", {"force": "b"})
 
@@ -174,8 +174,8 @@ def test_a_fast_sensor_that_is_not_in_seconds_is_refused(tmp_path: Path) -> None
     np.save(tmp_path / "video.npy", VIDEO)
     table = tmp_path / "ft.csv"
 
-    def read(seconds: float, of: float) -> importer_registry.Intake:
-        rows = [f"{of * k / 1000:.6f},0,0,1" for k in range(int(seconds * 1000))]
+    def read(seconds: float, ticks_per_s: float) -> importer_registry.Intake:
+        rows = [f"{ticks_per_s * k / 1000:.6f},0,0,1" for k in range(int(seconds * 1000))]
         table.write_text("\n".join(["t_s,fx,fy,fz", *rows]) + "\n")
         return importer_registry.read_source(tmp_path / "video.npy", {"fps": "25", "force": str(table)})
 

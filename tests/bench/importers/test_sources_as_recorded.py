@@ -72,78 +72,80 @@ def packets(codec: str = "libx264") -> Iterator[np.ndarray]:
             yield np.frombuffer(bytes(packet), np.uint8)
 
 
-def stamped() -> tuple[str, list[tuple[float, Any]]]:
+def make_wrenches() -> tuple[str, list[tuple[float, Any]]]:
     kind = "geometry_msgs/msg/WrenchStamped"
     return kind, [(s, T[kind](header=head(s), wrench=wrench(s))) for s in np.arange(0, 0.4, 0.01).tolist()]
 
 
-def check_forces(found: importer_registry.Intake) -> None:
+def check_forces(intake: importer_registry.Intake) -> None:
     s = np.arange(0, 0.4, 0.01)
-    np.testing.assert_allclose(found.force_s - START, s, atol=1e-5)
-    np.testing.assert_allclose(found.force, np.stack([0 * s, -0.5 * s, 1 + 0 * s], 1), atol=1e-9)
+    np.testing.assert_allclose(intake.force_s - START, s, atol=1e-5)
+    np.testing.assert_allclose(intake.force, np.stack([0 * s, -0.5 * s, 1 + 0 * s], 1), atol=1e-9)
 
 
-def nearest(found: importer_registry.Intake) -> list[int]:
-    return [int(np.argmin([np.abs(a.astype(int) - b).mean() for b in PICTURES])) for a in found.pictures()]
+def find_nearest(intake: importer_registry.Intake) -> list[int]:
+    return [int(np.argmin([np.abs(a.astype(int) - b).mean() for b in PICTURES])) for a in intake.pictures()]
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_a_bag_without_its_metadata(plugin: StoragePlugin, tmp_path: Path) -> None:
-    source = bag(tmp_path / "bag", {"/cam/image/compressed": jpegs(), "/ft": stamped()}, plugin)
+    source = bag(tmp_path / "bag", {"/cam/image/compressed": jpegs(), "/ft": make_wrenches()}, plugin)
     (source / "metadata.yaml").unlink()
-    for one in (source, next(path for path in source.iterdir())):
-        found = importer_registry.read_source(one)
-        assert nearest(found) == [*range(COUNT)]
-        check_forces(found)
+    for bag_path in (source, next(path for path in source.iterdir())):
+        intake = importer_registry.read_source(bag_path)
+        assert find_nearest(intake) == [*range(COUNT)]
+        check_forces(intake)
 
 
 @pytest.mark.parametrize("kind", ["foxglove_msgs/msg/CompressedVideo", "sensor_msgs/msg/CompressedImage"])
 def test_packets_of_a_video_as_messages(kind: str, tmp_path: Path) -> None:
-    when = {"timestamp": stamp} if "foxglove" in kind else {"header": head}
-    ((field, make),) = when.items()
-    more = {"frame_id": ""} if "foxglove" in kind else {}
+    time_field = {"timestamp": stamp} if "foxglove" in kind else {"header": head}
+    ((field, make),) = time_field.items()
+    extra_fields = {"frame_id": ""} if "foxglove" in kind else {}
     messages = [
-        (k / FPS, T[kind](**{field: make(k / FPS)}, data=data, format="h264", **more))
+        (k / FPS, T[kind](**{field: make(k / FPS)}, data=data, format="h264", **extra_fields))
         for k, data in enumerate(packets())
     ]
-    found = importer_registry.read_source(bag(tmp_path / "a", {"/video": (kind, messages), "/ft": stamped()}))
-    assert nearest(found) == [*range(COUNT)]
-    assert found.times_s - START == pytest.approx(np.arange(COUNT) / FPS, abs=1e-5)
+    intake = importer_registry.read_source(
+        bag(tmp_path / "a", {"/video": (kind, messages), "/ft": make_wrenches()})
+    )
+    assert find_nearest(intake) == [*range(COUNT)]
+    assert intake.times_s - START == pytest.approx(np.arange(COUNT) / FPS, abs=1e-5)
     # Recorded from between two key frames on: the first pictures can't be decoded, and are no others' times.
-    late = importer_registry.read_source(bag(tmp_path / "b", {"/video": (kind, messages[2:])}))
-    assert nearest(late) == [*range(5, COUNT)]
-    assert late.times_s - START == pytest.approx(np.arange(5, COUNT) / FPS, abs=1e-5)
+    late_intake = importer_registry.read_source(bag(tmp_path / "b", {"/video": (kind, messages[2:])}))
+    assert find_nearest(late_intake) == [*range(5, COUNT)]
+    assert late_intake.times_s - START == pytest.approx(np.arange(5, COUNT) / FPS, abs=1e-5)
 
 
 def test_forces_inside_other_messages(tmp_path: Path) -> None:
     temperature = T["sensor_msgs/msg/Temperature"](header=head(0), temperature=20.0, variance=0.0)
     kind, layout = "device_msgs/msg/Reading", T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     device = [
-        (s, T[kind](header=head(s), saturated=False, wrench=one, temperature=temperature))
-        for s, one in stamped()[1]
+        (s, T[kind](header=head(s), saturated=False, wrench=message, temperature=temperature))
+        for s, message in make_wrenches()[1]
     ]
     array = "std_msgs/msg/Float64MultiArray"
     numbers = [
         (s, T[array](layout=layout, data=np.array([0, -0.5 * s, 1, 9, 9, 9.0])))
         for s in np.arange(0, 0.4, 0.01).tolist()
     ]
-    two = "device_msgs/msg/Two"
-    both = [(0.1, T[two](left=wrench(0), right=wrench(0)))]
+    pair_kind = "device_msgs/msg/Two"
+    pairs = [(0.1, T[pair_kind](left=wrench(0), right=wrench(0)))]
     topics: Topics = {
-        "/cam": jpegs(), "/device": (kind, device), "/array": (array, numbers), "/two": (two, both)
+        "/cam": jpegs(), "/device": (kind, device), "/array": (array, numbers), "/two": (pair_kind, pairs)
     }  # fmt: skip
     source = bag(tmp_path / "bag", topics)
     check_forces(importer_registry.read_source(source))
     check_forces(importer_registry.read_source(source, {"force": "/device"}))
     check_forces(importer_registry.read_source(source, {"force": "/array"}))
-    for wanted in ("/two", "/cam", "/nowhere"):
+    for topic in ("/two", "/cam", "/nowhere"):
         with pytest.raises(UserError, match=re.escape("/device")):
-            importer_registry.read_source(source, {"force": wanted})
-    lone = importer_registry.read_source(
+            importer_registry.read_source(source, {"force": topic})
+    lone_intake = importer_registry.read_source(
         bag(tmp_path / "lone", {"/cam": jpegs(), "/array": (array, numbers)})
     )
-    assert len(lone.force) == 0
-    assert any("/array (std_msgs/msg/Float64MultiArray)" in note for note in lone.notes)
+    assert len(lone_intake.force) == 0
+    assert any("/array (std_msgs/msg/Float64MultiArray)" in note for note in lone_intake.notes)
 
 
 def test_a_bag_cut_off_is_named_with_its_cure(tmp_path: Path) -> None:
@@ -154,7 +156,7 @@ def test_a_bag_cut_off_is_named_with_its_cure(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "named"),
+    ("name", "content", "hint"),
     [
         ("a.bag.active", b"#ROSBAG V2.0", "rosbag reindex"),
         ("a.db3.zstd", b"\x28\xb5\x2f\xfd00", "zstd -d"),
@@ -172,25 +174,29 @@ def test_a_bag_cut_off_is_named_with_its_cure(tmp_path: Path) -> None:
     ],
 )
 def test_an_unknown_file_is_named_with_what_it_is(
-    name: str, content: bytes, named: str, tmp_path: Path
+    name: str, content: bytes, hint: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(UserError, match=named) as refused:
+    with pytest.raises(UserError, match=hint) as caught:
         importer_registry.read_source(tmp_path / name)
-    assert "wrong ending" not in str(refused.value)
+    assert "wrong ending" not in str(caught.value)
 
 
 def test_stated_units_are_not_applied_twice(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.stack(PICTURES))
     rows = "".join(f"{k / 10},1,2,3\n" for k in range(9))
     (tmp_path / "f.csv").write_text("t,Fx (mN),Fy (mN),Fz (mN)\n" + rows)
-    found = importer_registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
-    assert found.force[0] == pytest.approx([1e-3, 2e-3, 3e-3])
+    intake = importer_registry.read_source(
+        tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")}
+    )
+    assert intake.force[0] == pytest.approx([1e-3, 2e-3, 3e-3])
     with pytest.raises(UserError, match="newtons"):
-        importer_registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
+        importer_registry.write_recording(intake, tmp_path / "out", 0.001, {}, lambda done: None)
     (tmp_path / "f.csv").write_text("t,Fz\n" + "".join(f"{k / 10},{k}\n" for k in range(9)))
-    found = importer_registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
-    importer_registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
+    intake = importer_registry.read_source(
+        tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")}
+    )
+    importer_registry.write_recording(intake, tmp_path / "out", 0.001, {}, lambda done: None)
     assert (tmp_path / "out/force.csv").read_text().splitlines()[:3] == ["t_s,fz_n", "0.000000,0.000000000",
                                                                         "0.100000,0.001000000"]  # fmt: skip
 
@@ -200,29 +206,29 @@ def dicom(path: Path, syntax: str, pixels: Any, **about: object) -> Path:
     from pydicom.encaps import encapsulate
     from pydicom.uid import UID
 
-    held = Dataset()
-    held.file_meta = FileMetaDataset()
-    held.file_meta.TransferSyntaxUID = UID(syntax)
-    held.file_meta.MediaStorageSOPClassUID = held.SOPClassUID = "1.2.840.10008.5.1.4.1.1.77.1.1.1"
-    held.file_meta.MediaStorageSOPInstanceUID = held.SOPInstanceUID = "1.2.3"
-    held.Rows, held.Columns, held.NumberOfFrames = 96, 128, COUNT
-    held.SamplesPerPixel, held.PlanarConfiguration, held.PhotometricInterpretation = 3, 0, "RGB"
-    held.BitsAllocated, held.BitsStored, held.HighBit, held.PixelRepresentation = 8, 8, 7, 0
+    dataset = Dataset()
+    dataset.file_meta = FileMetaDataset()
+    dataset.file_meta.TransferSyntaxUID = UID(syntax)
+    dataset.file_meta.MediaStorageSOPClassUID = dataset.SOPClassUID = "1.2.840.10008.5.1.4.1.1.77.1.1.1"
+    dataset.file_meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID = "1.2.3"
+    dataset.Rows, dataset.Columns, dataset.NumberOfFrames = 96, 128, COUNT
+    dataset.SamplesPerPixel, dataset.PlanarConfiguration, dataset.PhotometricInterpretation = 3, 0, "RGB"
+    dataset.BitsAllocated, dataset.BitsStored, dataset.HighBit, dataset.PixelRepresentation = 8, 8, 7, 0
     for key, value in about.items():
-        setattr(held, key, value)
+        setattr(dataset, key, value)
     is_raw = isinstance(pixels, np.ndarray)
-    held.PixelData = pixels.tobytes() if is_raw else encapsulate([pixels])
-    held["PixelData"].is_undefined_length = not is_raw
-    held.save_as(path, enforce_file_format=True)
+    dataset.PixelData = pixels.tobytes() if is_raw else encapsulate([pixels])
+    dataset["PixelData"].is_undefined_length = not is_raw
+    dataset.save_as(path, enforce_file_format=True)
     return path
 
 
 def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
     pytest.importorskip("pydicom")
     source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", np.stack(PICTURES), FrameTime="40")
-    found = importer_registry.read_source(source)
-    assert np.array_equal(np.stack(list(found.pictures())), np.stack(PICTURES))
-    assert found.times_s == pytest.approx(np.arange(COUNT) / FPS)
+    intake = importer_registry.read_source(source)
+    assert np.array_equal(np.stack(list(intake.pictures())), np.stack(PICTURES))
+    assert intake.times_s == pytest.approx(np.arange(COUNT) / FPS)
     with pytest.raises(UserError, match="without times"):
         importer_registry.read_source(dicom(tmp_path / "b.dcm", "1.2.840.10008.1.2.1", np.stack(PICTURES)))
     with av.open(str(tmp_path / "v.ts"), "w") as out:
@@ -231,10 +237,10 @@ def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
         for rgb in PICTURES:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
         out.mux(stream.encode(None))
-    inside = dicom(tmp_path / "c.dcm", "1.2.840.10008.1.2.4.102", (tmp_path / "v.ts").read_bytes())
-    found = importer_registry.read_source(inside)
-    assert nearest(found) == [*range(COUNT)]
-    assert found.times_s == pytest.approx(np.arange(COUNT) / FPS, abs=1e-4)
+    video_source = dicom(tmp_path / "c.dcm", "1.2.840.10008.1.2.4.102", (tmp_path / "v.ts").read_bytes())
+    intake = importer_registry.read_source(video_source)
+    assert find_nearest(intake) == [*range(COUNT)]
+    assert intake.times_s == pytest.approx(np.arange(COUNT) / FPS, abs=1e-4)
 
 
 def test_dicom_of_a_video_of_inverted_grey(tmp_path: Path) -> None:
@@ -249,17 +255,17 @@ def test_dicom_of_a_video_of_inverted_grey(tmp_path: Path) -> None:
     about = {"PhotometricInterpretation": "MONOCHROME1", "SamplesPerPixel": 1}
     data = (tmp_path / "v.ts").read_bytes()
     source = dicom(tmp_path / "c.dcm", "1.2.840.10008.1.2.4.102", data, **about)
-    shown = np.stack(list(importer_registry.read_source(source).pictures()))[..., 1].astype(int)
-    assert np.abs(shown - np.stack(PICTURES)[..., 1]).mean() < 4
+    grey = np.stack(list(importer_registry.read_source(source).pictures()))[..., 1].astype(int)
+    assert np.abs(grey - np.stack(PICTURES)[..., 1]).mean() < 4
 
 
-@pytest.mark.parametrize("stored", [8, 12])
-def test_dicom_of_inverted_grey(stored: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("bits", [8, 12])
+def test_dicom_of_inverted_grey(bits: int, tmp_path: Path) -> None:
     pytest.importorskip("pydicom")
-    dark = np.stack([picture[..., 1] for picture in PICTURES]).astype("<u2" if stored > 8 else "u1")
-    about = {"SamplesPerPixel": 1, "BitsAllocated": 8 if stored == 8 else 16, "BitsStored": stored}
-    about |= {"HighBit": stored - 1, "FrameTime": "40", "PhotometricInterpretation": "MONOCHROME1"}
-    values = ((1 << stored) - 1) - (dark << (stored - 8))
+    dark = np.stack([picture[..., 1] for picture in PICTURES]).astype("<u2" if bits > 8 else "u1")
+    about = {"SamplesPerPixel": 1, "BitsAllocated": 8 if bits == 8 else 16, "BitsStored": bits}
+    about |= {"HighBit": bits - 1, "FrameTime": "40", "PhotometricInterpretation": "MONOCHROME1"}
+    values = ((1 << bits) - 1) - (dark << (bits - 8))
     source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", values.astype(dark.dtype), **about)
     grey = np.stack(list(importer_registry.read_source(source).pictures()))[..., 0].astype(int)
     np.testing.assert_allclose(grey, dark, atol=1)

@@ -30,13 +30,13 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         cache.cache_clear()
 
 
-def solve_directly(tissue: TissueKind, some: NDArray[np.intp]) -> Floats:
+def solve_directly(tissue: TissueKind, nodes: NDArray[np.intp]) -> Floats:
     """Columns of the compliance (3 P, 3 S), by the factor of the whole mesh."""
     block, lattice = ElasticBlock.build(TETS, tissue), compliance.lattice()
-    observed, loaded = block.embed(lattice.points), block.embed(lattice.nodes)
-    unit = np.einsum("kl,ab->kbal", np.eye(len(lattice.nodes))[:, some], TO_CAMERA)
-    u = block.system.solve(loaded.gather(unit.reshape(len(lattice.nodes), 3, -1)))
-    return picture(observed, u, 3).transpose(1, 0, 2).reshape(3 * len(lattice.points), -1)
+    observed_points, loaded_points = block.embed(lattice.points), block.embed(lattice.nodes)
+    unit = np.einsum("kl,ab->kbal", np.eye(len(lattice.nodes))[:, nodes], TO_CAMERA)
+    u = block.system.solve(loaded_points.gather(unit.reshape(len(lattice.nodes), 3, -1)))
+    return picture(observed_points, u, 3).transpose(1, 0, 2).reshape(3 * len(lattice.points), -1)
 
 
 @pytest.mark.parametrize(
@@ -49,11 +49,11 @@ def solve_directly(tissue: TissueKind, some: NDArray[np.intp]) -> Floats:
     ],
 )
 def test_compliances_are_those_of_direct_solutions(coarse: None, tissue: TissueKind) -> None:
-    some = np.arange(0, len(compliance.lattice().nodes), 25)
-    direct = solve_directly(tissue, some)
+    nodes = np.arange(0, len(compliance.lattice().nodes), 25)
+    direct = solve_directly(tissue, nodes)
     for components, alone in ((2, False), (3, False), (3, True)):
         matrix = compliance.solve(tissue, components, alone=alone)
-        columns = matrix.reshape(len(matrix), 3, -1)[..., some].reshape(len(matrix), -1)
+        columns = matrix.reshape(len(matrix), 3, -1)[..., nodes].reshape(len(matrix), -1)
         # What surrounds the window is eliminated in single precision.
         np.testing.assert_allclose(columns, direct[: len(matrix)], atol=2e-6 * np.abs(direct).max(), rtol=0)
         assert np.linalg.norm(columns - direct[: len(matrix)]) < 1e-5 * np.linalg.norm(direct[: len(matrix)])
@@ -63,13 +63,13 @@ def test_a_condensed_mesh_moves_as_the_whole() -> None:
     volume = tetrahedra.block(300)
     system = assemble(volume, "linear", 0.45)
     rng = np.random.default_rng(0)
-    kept = rng.permutation(np.flatnonzero(~volume.fixed))[:40]
-    inner = condense(system.stiffness, volume.points, volume.cells, kept, volume.fixed)
+    master_nodes = rng.permutation(np.flatnonzero(~volume.fixed))[:40]
+    inner = condense(system.stiffness, volume.points, volume.cells, master_nodes, volume.fixed)
     force = np.zeros_like(volume.points)
-    force[kept] = rng.normal(size=(40, 3))
-    moved = np.linalg.solve(inner, force[kept].ravel())
+    force[master_nodes] = rng.normal(size=(40, 3))
+    u = np.linalg.solve(inner, force[master_nodes].ravel())
     np.testing.assert_allclose(
-        moved, system.solve(force)[kept].ravel(), rtol=0, atol=1e-9 * np.abs(moved).max()
+        u, system.solve(force)[master_nodes].ravel(), rtol=0, atol=1e-9 * np.abs(u).max()
     )
 
 
@@ -78,23 +78,23 @@ def test_a_basis_is_computed_once_and_again_if_its_file_is_cut_off(
 ) -> None:
     monkeypatch.setenv("SULCUS_CACHE", str(tmp_path))
     posterior.cache.folder.cache_clear()
-    solved, tissue = [], TissueKind("bonded", 40.0, 0.45)
+    calls, tissue = [], TissueKind("bonded", 40.0, 0.45)
     solve = compliance.solve
     monkeypatch.setattr(
-        compliance, "solve", lambda *which, **more: solved.append(which) or solve(*which, **more)
+        compliance, "solve", lambda *args, **options: calls.append(args) or solve(*args, **options)
     )
     first = posterior.load_basis(2, tissue)
     posterior.load_basis.cache_clear()
-    again = posterior.load_basis(2, tissue)
-    assert len(solved) == 1
+    second = posterior.load_basis(2, tissue)
+    assert len(calls) == 1
     for name in ("motion", "size", "force", "omitted", "contacts", "loads"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
-    (stored,) = tmp_path.rglob("*.npz")
-    assert stored.stat().st_size < 3e6
-    stored.write_bytes(stored.read_bytes()[:1000])
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    (file,) = tmp_path.rglob("*.npz")
+    assert file.stat().st_size < 3e6
+    file.write_bytes(file.read_bytes()[:1000])
     posterior.load_basis.cache_clear()
     posterior.load_basis(2, tissue)
-    assert len(solved) == 2
+    assert len(calls) == 2
     posterior.cache.folder.cache_clear()
 
 

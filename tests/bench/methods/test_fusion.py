@@ -18,26 +18,26 @@ def estimate(forces: list[Floats], deviations: list[float], weights: list[float]
     return ForceEstimate(mixture.mean, low_mn=0.0, high_mn=20.0, likely=mixture)
 
 
-def fuse_one(network: ForceEstimate, physics: ForceEstimate) -> ForceEstimate:
+def fuse_frame(network: ForceEstimate, physics: ForceEstimate) -> ForceEstimate:
     return Fusion("network", "physics").fuse([{"network": network, "physics": physics}], SCENE, 2)[0]
 
 
 def test_gaussians_are_weighted_by_their_precisions_and_the_network_alone_without_a_stated_error() -> None:
     a, b = np.array([3.0, 0.0, 1.0]), np.array([1.0, 2.0, 0.0])
     physics = estimate([b], [0.5], [1.0])
-    found = fuse_one(estimate([a], [1 / CAUTION], [1.0]), physics)
-    np.testing.assert_allclose(found.force_mn, (a + 4 * b) / 5)
+    fused = fuse_frame(estimate([a], [1 / CAUTION], [1.0]), physics)
+    np.testing.assert_allclose(fused.force_mn, (a + 4 * b) / 5)
     np.testing.assert_allclose(physics.likely.observe(a, np.eye(3)).covariance[0], np.eye(3) / 5, atol=1e-12)
-    alone = fuse_one(estimate([a], [1.0], [1.0]), ForceEstimate(b))
-    np.testing.assert_array_equal(alone.force_mn, a)
+    network_only = fuse_frame(estimate([a], [1.0], [1.0]), ForceEstimate(b))
+    np.testing.assert_array_equal(network_only.force_mn, a)
 
 
 def test_components_that_contradict_the_network_lose_weight() -> None:
-    near, far = np.array([2.0, 0.0, 0.0]), np.array([5.0, 0.0, 0.0])
-    physics = estimate([near, far], [0.8, 0.8], [0.3, 0.7]).likely
+    near_force, far_force = np.array([2.0, 0.0, 0.0]), np.array([5.0, 0.0, 0.0])
+    physics = estimate([near_force, far_force], [0.8, 0.8], [0.3, 0.7]).likely
     odds = 0.7 / 0.3 * np.exp(-(3.0**2) / 2)  # variances add up to 1
-    found = physics.observe(near, 0.36 * np.eye(3))
-    np.testing.assert_allclose(found.weight, [1 / (1 + odds), odds / (1 + odds)])
+    mixture = physics.observe(near_force, 0.36 * np.eye(3))
+    np.testing.assert_allclose(mixture.weight, [1 / (1 + odds), odds / (1 + odds)])
 
 
 def test_the_magnitude_counts_the_component_that_the_motion_does_not_show() -> None:
@@ -47,8 +47,8 @@ def test_the_magnitude_counts_the_component_that_the_motion_does_not_show() -> N
     hidden = np.trapezoid(np.hypot(3, 4 * z) * np.exp(-(z**2) / 2), z) / np.sqrt(2 * np.pi)
     flat = ForceMixture(np.ones(1), np.array([[3.0, 0, 0]]), np.diag([1e-4, 1e-4, 16.0])[None])
     np.testing.assert_allclose(flat.mean_size, hidden, rtol=0.04)
-    sure = estimate([np.array([3.0, 0, 0])], [1e-3], [1.0])
-    frames = [{"network": sure, "physics": ForceEstimate(flat.mean, likely=flat)}]
+    network = estimate([np.array([3.0, 0, 0])], [1e-3], [1.0])
+    frames = [{"network": network, "physics": ForceEstimate(flat.mean, likely=flat)}]
     for cameras, size in ((1, hidden), (2, 3.0)):
         (fused,) = Fusion("network", "physics").fuse(frames, SCENE, cameras)
         np.testing.assert_allclose(np.linalg.norm(fused.force_mn), 3.0, rtol=0.01)

@@ -16,33 +16,35 @@ from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.motion import TimeScheme
 from synth.fem.solver import deform
-from synth.flow.stereo.stereo_track import Moved
+from synth.flow.stereo.stereo_track import Motion3D
 
 SCENES = FELUPE["openings"]
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: f"{scene['alpha']:g}")
 def test_the_force_behind_felupes_motion_is_found(scene: dict) -> None:  # type: ignore[type-arg]
-    found = compare_estimate(scene)
-    assert found["slope"] > large_motion.STEEP
-    assert found["force_error"] <= 0.12
+    comparison = compare_estimate(scene)
+    assert comparison["slope"] > large_motion.STEEP
+    assert comparison["force_error"] <= 0.12
 
 
 @pytest.mark.parametrize("opening_mm", [18.0, pytest.param(25.0, marks=pytest.mark.slow)])
 def test_the_force_is_found_where_the_picture_cuts_a_wide_opening(opening_mm: float) -> None:
-    way = np.array([1.0, 0.2, -0.15])
-    pull = gesture("retract", tuple(way / np.linalg.norm(way)), 4.5, size=(14.0, 9.0), place=(-3.0, 0.0))
+    direction = np.array([1.0, 0.2, -0.15])
+    pull = gesture(
+        "retract", tuple(direction / np.linalg.norm(direction)), 4.5, size=(14.0, 9.0), place=(-3.0, 0.0)
+    )
     tissue, surface = Tissue(1.0, 0.45, "ogden", alpha=-8.0), patch(61, 46.0)
     tets = tetrahedra.block(700, list(pull.focus), opening_mm=opening_mm, dome_mm=DOME_MM)
     motion = deform(TimeScheme(), tissue, [pull], tets, surface, 3, 5.0)
     force, grid = motion.force[1] * [1, -1, -1], physics.GRID
     axis = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
     x, y = np.meshgrid(axis, axis)
-    along = CloughTocher2DInterpolator(surface.vertices[:, :2], motion.displacement[1])
-    moved = np.moveaxis(along(np.stack([x, -y], axis=-1)) * [1, -1, -1], -1, 0)
-    shown = (np.maximum(np.abs(x), np.abs(y)) < 13) & (np.hypot(x, y) < opening_mm)
-    seen = large_motion.seen_motion(moved, np.full(moved.shape, 0.01), shown, grid)
-    answer = large_motion.reaction(seen, TissueKind("bonded", 0.0, 0.45), None, -8.0)
+    interpolate = CloughTocher2DInterpolator(surface.vertices[:, :2], motion.displacement[1])
+    displacement = np.moveaxis(interpolate(np.stack([x, -y], axis=-1)) * [1, -1, -1], -1, 0)
+    in_view = (np.maximum(np.abs(x), np.abs(y)) < 13) & (np.hypot(x, y) < opening_mm)
+    observation = large_motion.measure_motion(displacement, np.full(displacement.shape, 0.01), in_view, grid)
+    answer = large_motion.reaction(observation, TissueKind("bonded", 0.0, 0.45), None, -8.0)
     assert np.linalg.norm(answer - force) <= 0.1 * np.linalg.norm(force)
 
 
@@ -57,17 +59,19 @@ def test_large_forces_are_estimated_or_said_to_be_out_of_range(
     side, young_kpa, scale = 120, 4.0, 0.22
     axis = (np.arange(side) - (side - 1) / 2) * scale
     x, y = np.meshgrid(axis, axis)
-    moved, force = motion_of(scene, x, y)
+    displacement, force = motion_of(scene, x, y)
     size = young_kpa * np.linalg.norm(force)
     assert size > 100
     poisson, alpha = (scene["poisson"],) * 2, (scene["alpha"],) * 2
     tissue = np.hypot(x, y) < OPENING_MM
     context = MethodContext(tissue, scale, young_kpa, membrane, poisson, living=False, alpha=alpha)
-    method, sure = physics.Physics(), np.ones(x.shape, np.float32)
+    method, confidence = physics.Physics(), np.ones(x.shape, np.float32)
     for part in (0.0, 0.0, 1.0):
-        flow = (part * moved[..., :2] / scale).astype(np.float32)
-        three = Moved((part * moved).astype(np.float32), np.full(moved.shape, 0.01, np.float32))
-        method(FrameMotion(flow, sure, motion=three if cameras == 2 else None), context, False)
+        flow = (part * displacement[..., :2] / scale).astype(np.float32)
+        stereo_motion = Motion3D(
+            (part * displacement).astype(np.float32), np.full(displacement.shape, 0.01, np.float32)
+        )
+        method(FrameMotion(flow, confidence, motion=stereo_motion if cameras == 2 else None), context, False)
     answer = method.revise(np.array([True, True, False]))[-1]
     if cameras == 2:
         assert answer.size_mn == pytest.approx(size, rel=0.12)

@@ -42,8 +42,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Maker(tmp_path_factory.mktemp("plugins"))(frames=8)
 
 
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> None:
-    points = {method_plugins.METHODS.group: {name: f"lab_methods:{at}" for name, at in named.items()}}
+def install_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **methods: str) -> None:
+    values = {name: f"lab_methods:{attribute}" for name, attribute in methods.items()}
+    points = {method_plugins.METHODS.group: values}
     tiny_package.install(tmp_path / "site", "lab_methods", CODE, points, monkeypatch)
 
 
@@ -51,30 +52,30 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> 
 def test_a_plug_in_is_scored_with_the_network(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    installed(tmp_path, monkeypatch, pushes="Push")
+    install_methods(tmp_path, monkeypatch, pushes="Push")
     model = write_model(tmp_path / "model", "arch.output=vector")
     settings = bench.Settings(rate_hz=None, pulse=False)
     result = bench.score(recording, model, settings=settings, out=tmp_path / "score")
     assert next(iter(result.methods)) == result.main == "D2FNet"
     assert {"physics", "network and physics"} < set(result.methods)
-    own = result.methods["pushes"]
-    assert own.scores["mae_mn"] < np.nanmean(np.abs(result.sensor_mn)) / 3
-    assert own.worse_by_mn is not None, "paired with the network on the same frames"
+    plugin_method = result.methods["pushes"]
+    assert plugin_method.scores["mae_mn"] < np.nanmean(np.abs(result.sensor_mn)) / 3
+    assert plugin_method.worse_by_mn is not None, "paired with the network on the same frames"
     tree = json.loads((tmp_path / "score/score.json").read_text("utf-8"))
-    assert tree["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(own.scores["mae_mn"])
+    assert tree["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(plugin_method.scores["mae_mn"])
     assert tree["settings"]["plug_ins"] == {"pushes": "lab_methods 1.2"}
-    again = bench.score(recording, model, settings=settings)
-    assert again.methods["pushes"].scores == pytest.approx(own.scores, nan_ok=True)
+    repeated = bench.score(recording, model, settings=settings)
+    assert repeated.methods["pushes"].scores == pytest.approx(plugin_method.scores, nan_ok=True)
     assert "pushes" not in bench.score(recording, model, settings=settings, baselines=False).methods
 
 
-@pytest.mark.parametrize("at", ["raises", "exits", "silent", "short", "nothing", "Missing"])
+@pytest.mark.parametrize("attribute", ["raises", "exits", "silent", "short", "nothing", "Missing"])
 def test_errors_name_the_plug_in(
-    at: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    attribute: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    installed(tmp_path, monkeypatch, own=at)
+    install_methods(tmp_path, monkeypatch, own=attribute)
     model = write_model(tmp_path / "model", "arch.output=vector")
-    with pytest.raises(UserError, match=rf"method own \(lab_methods:{at}\)"):
+    with pytest.raises(UserError, match=rf"method own \(lab_methods:{attribute}\)"):
         bench.score(recording, model, settings=QUICK)
 
 
@@ -85,9 +86,11 @@ def test_a_method_cannot_change_the_others_input(recording: Path) -> None:
         assert not scene.tissue.flags.writeable
         return force
 
-    both = bench.score(recording, methods={"a": wipe, "b": wipe}, settings=QUICK, baselines=False).methods
-    np.testing.assert_array_equal(both["a"].size_mn, both["b"].size_mn)
-    assert np.nanmax(both["b"].size_mn) > 0
+    scored_methods = bench.score(
+        recording, methods={"a": wipe, "b": wipe}, settings=QUICK, baselines=False
+    ).methods
+    np.testing.assert_array_equal(scored_methods["a"].size_mn, scored_methods["b"].size_mn)
+    assert np.nanmax(scored_methods["b"].size_mn) > 0
 
 
 def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
@@ -102,8 +105,8 @@ def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
             return [bench.ForceEstimate(np.array([1.0 + k, 0.0, 0.0])) for k in range(count)]
 
     later = Later()
-    found = bench.score(recording, methods={"later": later}, settings=QUICK, baselines=False)
-    assert found.methods["later"].size_mn.tolist() == [1.0 + k for k in range(len(found.time_s))]
+    result = bench.score(recording, methods={"later": later}, settings=QUICK, baselines=False)
+    assert result.methods["later"].size_mn.tolist() == [1.0 + k for k in range(len(result.time_s))]
     later.short = True
     with pytest.raises(UserError):
         bench.score(recording, methods={"later": later}, settings=QUICK, baselines=False)
@@ -112,9 +115,9 @@ def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
 def test_no_method_takes_the_name_of_another(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = {"network and physics": lambda *inputs: bench.ForceEstimate(np.zeros(3))}
+    methods = {"network and physics": lambda *inputs: bench.ForceEstimate(np.zeros(3))}
     with pytest.raises(UserError):
-        bench.score(recording, methods=own)
-    installed(tmp_path, monkeypatch, physics="Push")
+        bench.score(recording, methods=methods)
+    install_methods(tmp_path, monkeypatch, physics="Push")
     with pytest.raises(UserError, match="physics"):
         comparison.simpler_methods()

@@ -16,10 +16,10 @@ BARE = TissueKind("bonded", 0.0, 0.45)
 STILL = np.zeros((3, 6, 0))  # no own motion
 
 
-def observed(moved: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
+def observe(displacement: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
     """(P, C) mm with white noise, whose deviation is stated."""
-    noise = noise_mm * np.random.default_rng(seed).normal(size=moved.shape)
-    return Observation((moved + noise).T, np.full(moved.T.shape, max(noise_mm, 0.01)))
+    noise = noise_mm * np.random.default_rng(seed).normal(size=displacement.shape)
+    return Observation((displacement + noise).T, np.full(displacement.T.shape, max(noise_mm, 0.01)))
 
 
 @cache
@@ -27,7 +27,7 @@ def other_mesh(tissue: TissueKind) -> ElasticBlock:
     return ElasticBlock.build(2500, tissue)
 
 
-def pressed(basis: LoadBasis, tissue: TissueKind, force: list[float]) -> Floats:
+def press(basis: LoadBasis, tissue: TissueKind, force: list[float]) -> Floats:
     """Displacement (P, 3) mm, camera axes, of a 3 mm contact at (2, 3) mm on another mesh; mN/kPa."""
     block = other_mesh(tissue)
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
@@ -46,26 +46,26 @@ def basis() -> LoadBasis:
 @pytest.mark.slow
 @pytest.mark.parametrize("force", [[3.0, 0.0, 0.0], [0.0, -1.0, 4.0]])
 def test_a_contacts_force_is_estimated_and_in_its_interval(basis: LoadBasis, force: list[float]) -> None:
-    moved = pressed(basis, BARE, force)
+    displacement = press(basis, BARE, force)
     for noise in (0.0, 0.03):
-        found = posterior.infer(basis, observed(moved, noise), STILL)
-        assert found.force.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
-        low, high = physics.size_interval(found.force, 0.08)
+        estimate = posterior.infer(basis, observe(displacement, noise), STILL)
+        assert estimate.force.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
+        low, high = physics.size_interval(estimate.force, 0.08)
         assert low < np.linalg.norm(force) < high
-        assert found.load.sum(axis=0) == pytest.approx(found.force.mean, abs=1e-6)
-    across = posterior.infer(posterior.load_basis(2, BARE), observed(moved[:, :2], 0.01), STILL[:2])
-    assert across.force.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
+        assert estimate.load.sum(axis=0) == pytest.approx(estimate.force.mean, abs=1e-6)
+    monocular = posterior.infer(posterior.load_basis(2, BARE), observe(displacement[:, :2], 0.01), STILL[:2])
+    assert monocular.force.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
 
 
 @pytest.mark.slow
 def test_monocular_intervals_cover_presses_along_the_optical_axis(basis: LoadBasis) -> None:
     monocular, inside, count = posterior.load_basis(2, BARE), 0, 0
     for size in (1.0, 2.0, 3.0, 5.0):
-        moved = pressed(basis, BARE, [0.0, 0.0, size])[:, :2]
+        displacement = press(basis, BARE, [0.0, 0.0, size])[:, :2]
         for noise in (0.04, 0.06):
             for seed in range(5):
-                found = posterior.infer(monocular, observed(moved, noise, seed), STILL[:2])
-                low, high = physics.size_interval(found.force, 0.08, cameras=1)
+                estimate = posterior.infer(monocular, observe(displacement, noise, seed), STILL[:2])
+                low, high = physics.size_interval(estimate.force, 0.08, cameras=1)
                 inside, count = inside + (low <= size <= high), count + 1
     assert inside >= 0.85 * count
 
@@ -73,9 +73,9 @@ def test_monocular_intervals_cover_presses_along_the_optical_axis(basis: LoadBas
 @pytest.mark.slow
 def test_no_motion_is_no_force(basis: LoadBasis) -> None:
     for noise in (0.0, 0.03):
-        found = posterior.infer(basis, observed(np.zeros((len(basis.lattice.points), 3)), noise), STILL)
-        low, high = physics.size_interval(found.force, 0.08)
-        assert np.linalg.norm(found.force.mean) < 0.2
+        estimate = posterior.infer(basis, observe(np.zeros((len(basis.lattice.points), 3)), noise), STILL)
+        low, high = physics.size_interval(estimate.force, 0.08)
+        assert np.linalg.norm(estimate.force.mean) < 0.2
         assert low == 0.0
         assert 0 < high < 0.6
 
@@ -85,14 +85,14 @@ def test_the_tissues_own_motion_is_estimated_from_contact_free_frames(basis: Loa
     rng = np.random.default_rng(1)
     terms = posterior.polynomials(basis.lattice.points)
     shape = rng.normal(size=(6, 3)) * [0.0, 0.05, 0.25]  # lifts and bends as one; twice that is stated
-    own = [terms @ (np.sin(k) * shape) for k in range(1, 10)]
-    modes = posterior.own_motion(basis, [observed(one, 0.005) for one in own[:8]])
+    motions = [terms @ (np.sin(k) * shape) for k in range(1, 10)]
+    modes = posterior.own_motion(basis, [observe(motion, 0.005) for motion in motions[:8]])
     sizes = np.sqrt(np.square(modes).sum(axis=2).mean(axis=1))
     assert sizes == pytest.approx(np.sqrt(2 * np.square(shape).mean(axis=0)), rel=0.5, abs=0.03)
     assert np.square(modes[..., -1]).sum() > 0.8 * np.square(modes).sum()
     force = np.array([0.5, 0.0, 2.0])
-    both = observed(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
-    known, unknown = (posterior.infer(basis, both, size).force.mean for size in (modes, STILL))
+    observation = observe(press(basis, BARE, force.tolist()) + motions[8], 0.01)
+    known, unknown = (posterior.infer(basis, observation, size).force.mean for size in (modes, STILL))
     assert np.linalg.norm(known - force) < 0.25 * np.linalg.norm(force)
     assert np.linalg.norm(known - force) < 0.5 * np.linalg.norm(unknown - force)
 
@@ -108,14 +108,16 @@ def test_intervals_have_90_percent_coverage_of_draws_from_the_model(basis: LoadB
         contact = size * rng.normal(size=3)
         inward = basis.contacts[:, rng.integers(basis.contacts.shape[1])] @ contact
         coefficients = np.append(smooth + inward, sizes * rng.normal(size=18))
-        spare = np.sqrt(basis.omitted) * spread * rng.normal(size=3)
-        force = basis.force @ smooth + spare + contact
-        moved = (basis.motion @ coefficients).reshape(3, -1)
+        remainder = np.sqrt(basis.omitted) * spread * rng.normal(size=3)
+        force = basis.force @ smooth + remainder + contact
+        displacement = (basis.motion @ coefficients).reshape(3, -1)
         # With the model's enlarged variances.
-        local = basis.around @ np.square(moved).mean(axis=0)
+        local = basis.around @ np.square(displacement).mean(axis=0)
         noise = np.sqrt(model.correlated * (0.02**2 + model.least_mm**2 + model.misfit**2 * local))
-        drawn = Observation(moved + noise * rng.normal(size=moved.shape), np.full(moved.shape, 0.02))
-        low, high = physics.size_interval(posterior.infer(basis, drawn, modes).force, 0.0)
+        observation = Observation(
+            displacement + noise * rng.normal(size=displacement.shape), np.full(displacement.shape, 0.02)
+        )
+        low, high = physics.size_interval(posterior.infer(basis, observation, modes).force, 0.0)
         inside += low <= np.linalg.norm(force) <= high
     assert abs(inside / count - 0.9) < 3 * np.sqrt(0.09 / count)
 
@@ -136,11 +138,11 @@ def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
     u = -p * (1 - 2 * nu) * x / r**2 + q * (2 * (1 - nu) / r + 2 * nu * x**2 / r**3)
     v = -p * (1 - 2 * nu) * y / r**2 + q * 2 * nu * x * y / r**3
     w = p * 2 * (1 - nu) / r + q * (1 - 2 * nu) * x / r**2
-    moved = np.stack([(part * share).sum(axis=1) for part in (u, v, w)], axis=1)
+    displacement = np.stack([(part * share).sum(axis=1) for part in (u, v, w)], axis=1)
     free = posterior.load_basis(3, TissueKind("free", 0.0, nu))
     # The block's walls are fixed 50 mm away, where the half-space still sinks: allowed as own motion.
-    found = posterior.infer(free, observed(moved, 0.01), 0.05 * np.eye(18).reshape(3, 6, 18))
-    assert found.force.mean == pytest.approx(force, abs=0.15 * 3.2)
+    estimate = posterior.infer(free, observe(displacement, 0.01), 0.05 * np.eye(18).reshape(3, 6, 18))
+    assert estimate.force.mean == pytest.approx(force, abs=0.15 * 3.2)
 
 
 @pytest.mark.slow
@@ -149,31 +151,33 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
     scene = MethodContext(np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, 2.0)
     stiff = []
     for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
-        frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
-        found = physics.weigh_tissues(scene, frames, STILL)
-        stiff.append(found.tissues[0].membrane)
+        frames = [observe(press(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
+        weights = physics.weigh_tissues(scene, frames, STILL)
+        stiff.append(weights.tissues[0].membrane)
     # On another mesh bare tissue may be taken for a thin membrane, never for a thick one.
     assert stiff[0] <= 5
     assert stiff[1] > 20
-    stated = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
-    assert {(one.membrane, one.poisson) for one in physics.candidate_tissues(stated)} == {(0.0, 0.49)}
+    stated_scene = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
+    assert {
+        (candidate.membrane, candidate.poisson) for candidate in physics.candidate_tissues(stated_scene)
+    } == {(0.0, 0.49)}
 
 
 @pytest.mark.slow
 def test_a_stated_stiffness_of_the_membrane_gives_the_force(basis: LoadBasis) -> None:
     side, tissue, young = 80, TissueKind("bonded", 40.0, 0.45), 2.0
-    known = np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, young, "intact", (0.45, 0.45)
-    frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
+    context = np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, young, "intact", (0.45, 0.45)
+    frames = [observe(press(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
     true, sizes = np.hypot(1.0, 4.0), []
     for stiff in ((80.0, 80.0), (10.0, 10.0)):
-        scene = MethodContext(*known, membrane_mn_per_mm=stiff)
+        scene = MethodContext(*context, membrane_mn_per_mm=stiff)
         weights = physics.weigh_tissues(scene, frames, STILL)
         assert {tissue.membrane for tissue in weights.tissues} == {stiff[0] / young}
         sizes.append(float(np.linalg.norm(physics.infer(weights, frames[1]).force.mean)))
     assert sizes[0] == pytest.approx(true, rel=0.15)
     assert sizes[1] < 0.9 * sizes[0], "a membrane that is stated too soft hides force"
-    between = MethodContext(*known, membrane_mn_per_mm=(60.0, 100.0))
-    assert {one.membrane for one in physics.candidate_tissues(between)} == {30.0, 39.0, 50.0}
+    between = MethodContext(*context, membrane_mn_per_mm=(60.0, 100.0))
+    assert {candidate.membrane for candidate in physics.candidate_tissues(between)} == {30.0, 39.0, 50.0}
 
 
 def test_evidence_for_a_soft_membrane_is_not_taken_for_certain() -> None:
@@ -191,33 +195,33 @@ def test_the_quietest_frames_bound_the_tissues_own_motion() -> None:
     pulse_mm = 0.2 * (1 - np.cos(2 * np.pi * 0.25 * time_s)) + (time_s > 5) * 1.0
     still = [posterior.Observation(np.full((2, 9), 0.001 + (k > 50)), none) for k in range(100)]
     frames = [posterior.Observation(np.full((2, 9), size), none) for size in pulse_mm]
-    for of, low, high in ((frames, 0.1, 0.5), (still, 0.0, 0.03)):
-        quiet, factor = physics.quietest_frames(time_s, of)
-        assert low <= factor * max(of[k].size_mm for k in quiet) <= high
+    for observations, low, high in ((frames, 0.1, 0.5), (still, 0.0, 0.03)):
+        quiet, factor = physics.quietest_frames(time_s, observations)
+        assert low <= factor * max(observations[k].size_mm for k in quiet) <= high
     # A tenth of a second may be where breath turns.
     assert physics.quietest_frames(time_s[:2], still[:2])[1] > 100
 
 
 def test_a_short_span_does_not_exclude_a_breath() -> None:
     own_mm, shape = list[float](), np.ones((80, 80, 2), np.float32)
-    for living, stated in ((True, 0), (True, 2), (False, 2)):
+    for living, free_frames in ((True, 0), (True, 2), (False, 2)):
         scene = MethodContext(np.ones((80, 80), bool), 0.4, 2.0, "stripped", (0.45, 0.45), living=living)
         method = physics.Physics()
         for k in range(10):  # half a second shows little of a breath that has just turned
-            moved = shape * np.float32(1 - np.cos(2 * np.pi * 0.23 * (k / 2 + 0.3)))
-            method(FrameMotion(moved, shape[..., 0], time_s=k / 2), scene, False)
-        method.revise(np.arange(10) < stated)
+            flow = shape * np.float32(1 - np.cos(2 * np.pi * 0.23 * (k / 2 + 0.3)))
+            method(FrameMotion(flow, shape[..., 0], time_s=k / 2), scene, False)
+        method.revise(np.arange(10) < free_frames)
         own_mm.append(float(np.abs(method._weights.own_mm).max(initial=0.0)))
     assert 0 < own_mm[0] == own_mm[1] != own_mm[2]  # a specimen, which does not breathe, is measured
 
 
 def test_an_interval_holds_every_assumption_however_unlikely() -> None:
-    one, other = (
+    first, second = (
         force_mixture.ForceMixture(np.ones(1), np.array([[size, 0, 0]]), 1e-4 * np.eye(3)[None])
         for size in (1.0, 4.0)
     )
-    both = force_mixture.mix([one, other], np.array([1 - 1e-9, 1e-9]), [0, 1])
-    low, high = force_mixture.size_interval(both, 0.0)
-    assert np.linalg.norm(both.mean) == pytest.approx(1)
+    mixture = force_mixture.mix([first, second], np.array([1 - 1e-9, 1e-9]), [0, 1])
+    low, high = force_mixture.size_interval(mixture, 0.0)
+    assert np.linalg.norm(mixture.mean) == pytest.approx(1)
     assert low < 1
     assert high > 3.9

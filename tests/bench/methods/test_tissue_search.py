@@ -12,26 +12,26 @@ EDGES: tuple[Edge, ...] = ("bonded", "slipping")
 @pytest.mark.parametrize("seed", range(20))
 def test_the_most_likely_tissue_is_that_of_all(seed: int) -> None:
     """Evidence falls off on both sides of a stiffness that differs from edge to edge."""
-    rng, looked = np.random.default_rng(seed), set[TissueKind]()
+    rng, visited = np.random.default_rng(seed), set[TissueKind]()
     candidates = [
         TissueKind(edge, membrane, 0.45, stretch)
         for edge in EDGES
         for membrane in TISSUES.membranes_mm[1:]
         for stretch in TISSUES.stretches
     ]
-    best = dict(zip(EDGES, rng.uniform(np.log(3), np.log(400), 2), strict=True))
+    optimum = dict(zip(EDGES, rng.uniform(np.log(3), np.log(400), 2), strict=True))
     edge_gain, stretch_gain = rng.normal(size=2)
 
     def value(tissue: TissueKind) -> float:
-        looked.add(tissue)
+        visited.add(tissue)
         gain = edge_gain * (tissue.edge == "slipping") + stretch_gain * (tissue.stretch > 1)
-        return float(gain - (np.log(tissue.membrane) - best[tissue.edge]) ** 2)
+        return float(gain - (np.log(tissue.membrane) - optimum[tissue.edge]) ** 2)
 
     answer = find_largest(candidates, value)
-    assert len(looked) < len(candidates)
+    assert len(visited) < len(candidates)
     assert answer == max(candidates, key=value)
 
 
 def test_a_single_candidate_is_the_answer() -> None:
-    only = TissueKind("bonded", 0.0, 0.45)
-    assert find_largest([only], lambda _: 0.0) == only
+    candidate = TissueKind("bonded", 0.0, 0.45)
+    assert find_largest([candidate], lambda _: 0.0) == candidate

@@ -21,8 +21,8 @@ from synth.video import read_video as video
 def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
     times = np.array([0, 0.04, 0.08, 0.21, 0.233, 1.0])
     recording_writer.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
-    got = [picture.time_s for picture in video.read_video(tmp_path / "v.mp4")]
-    assert got == pytest.approx(times, abs=1e-4)
+    read_times = [picture.time_s for picture in video.read_video(tmp_path / "v.mp4")]
+    assert read_times == pytest.approx(times, abs=1e-4)
 
 
 def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
@@ -31,9 +31,9 @@ def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
     recording_writer.write_frames(tmp_path, times)
     recording_writer.write_force(tmp_path, times, np.eye(3))
     for name in ("frames", "force"):
-        read = csv_table.read_csv(tmp_path / f"{name}.csv", ("t_s",) + ("fy_n",) * (name == "force"))
-        assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
-    assert read["fy_n"].tolist() == [0, 1, 0]
+        table = csv_table.read_csv(tmp_path / f"{name}.csv", ("t_s",) + ("fy_n",) * (name == "force"))
+        assert table["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    assert table["fy_n"].tolist() == [0, 1, 0]
 
 
 def test_force_in_mn_sign_and_gaps(make: Maker) -> None:
@@ -55,7 +55,7 @@ def test_quoted_cells_and_unambiguous_decimal_commas_are_read(tmp_path: Path) ->
         ("t_s;fx_n\n0,5;-1,25\n", [[0.5], [-1.25]]),
     ):
         file.write_text(text)
-        assert [one.tolist() for one in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == expected
+        assert [column.tolist() for column in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == expected
     file.write_text("t_s,fx_n\n0,5,-1,25\n")
     with pytest.raises(UserError, match=r"t\.csv:2"):
         csv_table.read_csv(file, ("t_s", "fx_n"))
@@ -72,7 +72,7 @@ def test_frames_that_the_table_lacks_have_no_time(make: Maker, footage: str) -> 
         assert times == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
-def _numbered(folder: Path, count: int, first: int, lost: int) -> Recording:
+def _write_numbered(folder: Path, count: int, first: int, lost: int) -> Recording:
     """Pictures of which all but one are there, counted from `first`; masks and times of all, from 0."""
     for name in ("frames", "masks"):
         (folder / name).mkdir()
@@ -94,15 +94,15 @@ def test_files_of_one_moment_have_the_same_number(
     folder = tmp_path_factory.mktemp("numbered")
     if lost < count and (first or lost == 0):
         with pytest.raises(UserError, match=r"frames\.csv"):
-            _numbered(folder, count, first, lost)
+            _write_numbered(folder, count, first, lost)
         return
-    opened = _numbered(folder, count, first, lost)
-    pictures = list(opened.frames())
+    recording = _write_numbered(folder, count, first, lost)
+    pictures = list(recording.frames())
     assert len(pictures) == count - (lost < count)
     for picture in pictures:
         moment = int(picture.rgb[0, 0, 0])
         assert picture.time_s == 0.5 * moment
-        mask = opened.masks.read(picture.index, (4, 6))
+        mask = recording.masks.read(picture.index, (4, 6))
         assert mask.sum() == min(moment + 1, 24)
 
 
@@ -125,9 +125,9 @@ def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
 
 def test_frames_are_counted_if_the_container_does_not_state_their_number(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=9, footage="mp4")
-    with av.open(str(folder / "video.mp4")) as read, av.open(str(folder / "video.mkv"), "w") as copy:
-        stream = copy.add_stream_from_template(read.streams.video[0])
-        for packet in read.demux(video=0):
+    with av.open(str(folder / "video.mp4")) as source, av.open(str(folder / "video.mkv"), "w") as copy:
+        stream = copy.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
             if packet.size:
                 packet.stream = stream
                 copy.mux(packet)
@@ -136,7 +136,7 @@ def test_frames_are_counted_if_the_container_does_not_state_their_number(tmp_pat
 
 
 def test_a_written_meta_is_read_back_as_the_defaults(tmp_path: Path) -> None:
-    (tmp_path / "meta.yaml").write_text(meta.commented())
+    (tmp_path / "meta.yaml").write_text(meta.document_meta())
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
 
 

@@ -44,8 +44,8 @@ def test_the_force_of_one_instrument(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path / "000000.zarr")
     recording = open_recording(export_recording(sequence, tmp_path / "one", instrument=1))
     assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
-    done = run(app, "from-dataset", tmp_path, "-o", tmp_path / "two", "--instrument", "2", code=2)
-    assert "instrument 2" in done.output
+    result = run(app, "from-dataset", tmp_path, "-o", tmp_path / "two", "--instrument", "2", code=2)
+    assert "instrument 2" in result.output
     assert not (tmp_path / "two").exists()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from fake_recording import Maker, scored, texture
+from fake_recording import Maker, score_recording, texture
 
 from bench.checks.check_recording import check_recording
 from bench.recording import recording_writer
@@ -33,8 +33,8 @@ def cut_video(folder: Path) -> None:
     shutil.rmtree(folder / "frames")
     (folder / "frames.csv").unlink()
     recording_writer.write_video(folder / "video.mp4", iter([texture(96, 128)] * 6), np.arange(6) / 10)
-    whole = (folder / "video.mp4").read_bytes()
-    (folder / "video.mp4").write_bytes(whole[: len(whole) // 2])
+    data = (folder / "video.mp4").read_bytes()
+    (folder / "video.mp4").write_bytes(data[: len(data) // 2])
 
 
 HEAD = "t_s,fx_n,fy_n,fz_n\n"
@@ -59,10 +59,10 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_intact_recording_has_no_problems(intact: Path, tmp_path: Path) -> None:
-    drawn = tmp_path / "tracked.png"
-    severities = {finding.severity for finding in check_recording(intact, picture=drawn)}
+    picture_path = tmp_path / "tracked.png"
+    severities = {finding.severity for finding in check_recording(intact, picture=picture_path)}
     assert severities <= {"ok", "missing"}
-    rows, columns = np.array(cv2.imread(str(drawn)).shape[:2]) // (4 * 96, 4 * 128)
+    rows, columns = np.array(cv2.imread(str(picture_path)).shape[:2]) // (4 * 96, 4 * 128)
     assert (rows, columns) == (2, 3)  # five frames and a legend, enlarged fourfold
 
 
@@ -75,16 +75,16 @@ NUMBERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("changed", NUMBERS)
+@pytest.mark.parametrize("changes", NUMBERS)
 def test_numbers_beyond_all_recordings_are_refused(
-    intact: Path, tmp_path: Path, changed: dict[str, object]
+    intact: Path, tmp_path: Path, changes: dict[str, object]
 ) -> None:
     folder = tmp_path / "rec"
     shutil.copytree(intact, folder)
-    about = checked_file.read_yaml(folder / "meta.yaml") | changed
+    about = checked_file.read_yaml(folder / "meta.yaml") | changes
     recording_writer.write_meta(folder, {key: value for key, value in about.items() if value is not None})
-    (only,) = (one for one in check_recording(folder) if one.severity == "error")
-    assert "\n" not in only.message
+    (problem,) = (finding for finding in check_recording(folder) if finding.severity == "error")
+    assert "\n" not in problem.message
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -93,7 +93,10 @@ def test_the_largest_and_least_numbers_are_reported(intact: Path, tmp_path: Path
     shutil.copytree(intact, folder)
     about = checked_file.read_yaml(folder / "meta.yaml") | {"scale_mm_per_px": scale, "young_kpa": scale}
     recording_writer.write_meta(folder, about)
-    assert {one.cause for one in check_recording(folder) if one.severity == "error"} == {"scale", "stiffness"}
+    assert {finding.cause for finding in check_recording(folder) if finding.severity == "error"} == {
+        "scale",
+        "stiffness",
+    }
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -105,7 +108,7 @@ def test_a_broken_recording_is_reported(intact: Path, tmp_path: Path, name: str)
     assert any(finding.severity in ("warning", "error") for finding in findings)
     assert "scale" not in {finding.cause for finding in findings if finding.severity == "error"}
     try:
-        notes: tuple[str, ...] = scored(folder, backend="dis").notes
+        notes: tuple[str, ...] = score_recording(folder, backend="dis").notes
     except UserError as error:
         notes = (str(error),)
     assert not any("\n" in line for line in (*notes, *(finding.message for finding in findings)))

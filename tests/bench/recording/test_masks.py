@@ -34,8 +34,8 @@ def test_mask_png_is_used_for_frames_without_a_mask(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=4)
     _write(folder / "mask.png", 10)
     _write(folder / "masks" / "000002.png", 30)
-    opened = open_recording(folder)
-    widths = [int(found[0].sum()) for k in range(4) if (found := opened.masks.read(k, _SIZE)) is not None]
+    recording = open_recording(folder)
+    widths = [int(mask[0].sum()) for k in range(4) if (mask := recording.masks.read(k, _SIZE)) is not None]
     assert widths == [10, 10, 30, 10]
 
 
@@ -44,15 +44,15 @@ def test_masks_of_all_encodings_are_read(tmp_path: Path, kind: str) -> None:
     tool = np.zeros(_SIZE, np.uint8)
     tool[20:60, 30:90] = 1
     alpha = np.dstack([np.full((*_SIZE, 3), 255, np.uint8), 255 * tool])
-    saved = {"0 and 1": tool, "alpha": alpha, "white": 255 * tool, "16 bits": tool.astype(np.uint16)}
-    saved["soft"] = cv2.GaussianBlur(200 * tool, (0, 0), 1)
-    assert cv2.imwrite(str(tmp_path / "m.png"), saved[kind])
+    encodings = {"0 and 1": tool, "alpha": alpha, "white": 255 * tool, "16 bits": tool.astype(np.uint16)}
+    encodings["soft"] = cv2.GaussianBlur(200 * tool, (0, 0), 1)
+    assert cv2.imwrite(str(tmp_path / "m.png"), encodings[kind])
     assert np.sum(read_mask(tmp_path / "m.png", _SIZE) != tool) < 8
 
 
 def test_only_the_region_is_tissue(tmp_path: Path) -> None:
-    opened = replace(open_recording(Maker(tmp_path)(frames=2)), region=(20, 10, 40, 30))
-    tissue = opened.tissue_mask(_SIZE)
+    recording = replace(open_recording(Maker(tmp_path)(frames=2)), region=(20, 10, 40, 30))
+    tissue = recording.tissue_mask(_SIZE)
     assert tissue.sum() == 40 * 30
     assert tissue[10:40, 20:60].all()
 
@@ -60,51 +60,51 @@ def test_only_the_region_is_tissue(tmp_path: Path) -> None:
 def test_given_mask_is_masked_and_pictured(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=4)
     _write(folder / "mask.png", 32)
-    found = track_recording(open_recording(folder), {"bump": Bump()}, 0.2, RecordingFlowSettings())
-    assert found.summary.shares["masked"] == pytest.approx(0.25, abs=0.05)
-    assert found.trusted == [True] * 4
-    picture = picture_masks(found)
-    assert np.abs(picture.astype(int) - found.rest)[:, 40:].mean() < 1
-    assert np.abs(picture.astype(int) - found.rest)[:, :30].mean() > 20
+    tracked = track_recording(open_recording(folder), {"bump": Bump()}, 0.2, RecordingFlowSettings())
+    assert tracked.summary.shares["masked"] == pytest.approx(0.25, abs=0.05)
+    assert tracked.trusted == [True] * 4
+    picture = picture_masks(tracked)
+    assert np.abs(picture.astype(int) - tracked.rest)[:, 40:].mean() < 1
+    assert np.abs(picture.astype(int) - tracked.rest)[:, :30].mean() > 20
 
 
 def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
     folder, contexts = make(frames=12, size=OPENING.shape), list[MethodContext]()
     files = sorted((folder / "frames").iterdir())
-    for path, one in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
-        assert cv2.imwrite(str(path), one.rgb[..., ::-1])
+    for path, source_picture in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
+        assert cv2.imwrite(str(path), source_picture.rgb[..., ::-1])
 
     def method(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         contexts.append(scene)
         return ForceEstimate(np.zeros(3))
 
-    found = track_recording(open_recording(folder), {"own": method}, 0.2, SETTINGS)
+    tracked = track_recording(open_recording(folder), {"own": method}, 0.2, SETTINGS)
     tissue = contexts[-1].tissue
     assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
-    assert ("missing", "tissue") in [(one.severity, one.cause) for one in found.findings]
-    assert picture_masks(found) is not None  # shows its outline
+    assert ("missing", "tissue") in [(finding.severity, finding.cause) for finding in tracked.findings]
+    assert picture_masks(tracked) is not None  # shows its outline
 
 
 def test_a_tissue_is_proposed_and_never_written_over(make: Maker) -> None:
     folder = make(frames=12, size=OPENING.shape)
     files = sorted((folder / "frames").iterdir())
-    for path, one in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
-        assert cv2.imwrite(str(path), one.rgb[..., ::-1])
-    mask, shown, doubt = propose_tissue(folder)
+    for path, picture in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
+        assert cv2.imwrite(str(path), picture.rgb[..., ::-1])
+    mask, overlay, doubt = propose_tissue(folder)
     tissue = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) > 0
     assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
-    assert shown.is_file()
+    assert overlay.is_file()
     assert doubt == ""
     with pytest.raises(UserError, match="exists"):
         propose_tissue(folder)
 
 
-@pytest.mark.parametrize("shown", [range(6, 14), range(9, 14), range(20), range(0)])
-def test_no_contact_is_where_an_instrument_is_away_and_motion_is_smooth(shown: range) -> None:
+@pytest.mark.parametrize("visible_frames", [range(6, 14), range(9, 14), range(20), range(0)])
+def test_no_contact_is_where_an_instrument_is_away_and_motion_is_smooth(visible_frames: range) -> None:
     """It presses in frames 6 to 13 of a breath; in three of these cases its mask shows less, or more."""
     search = ContactFreeSearch(np.ones(ROD.shape, bool), 0.2)
     for k in range(20):
         breath = np.float32(np.sin(k)) * np.dstack([1 + X / 80, X * Y / 4000])
-        moved, sure = breath + load(2.0 * (k in range(6, 14))), np.ones(ROD.shape, np.float32)
-        search.add(FrameMotion(moved, sure, tool=ROD & (k in shown)), k / 4)
-    assert list(search.find()) == ([(0.0, 1.25), (3.5, 4.75)] if shown == range(6, 14) else [])
+        flow, confidence = breath + load(2.0 * (k in range(6, 14))), np.ones(ROD.shape, np.float32)
+        search.add(FrameMotion(flow, confidence, tool=ROD & (k in visible_frames)), k / 4)
+    assert list(search.find()) == ([(0.0, 1.25), (3.5, 4.75)] if visible_frames == range(6, 14) else [])

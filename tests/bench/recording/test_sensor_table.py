@@ -29,7 +29,7 @@ def clock(form: str) -> str:
 
 
 LVM = "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\nChannels\t3\n***End_of_Header***\n"
-WRITTEN = {
+TABLES = {
     "head lines": "Calibration:,FT1\nForce units:,N\nSample rate:,500\n\nTime,Fx,Fy,Fz\n" + plain(),
     "lvm": LVM + "X_Value\tFx\tFy\tFz\tComment\n" + plain("\t"),
     "lvm without times": LVM + "Delta_X\t0.002\nFx\tFy\tFz\n" + rows(F, "\t"),
@@ -64,13 +64,13 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("name", TABLES)
 def test_three_axes_are_read_with_their_times(name: str, tmp_path: Path) -> None:
-    (tmp_path / "f.csv").write_text(WRITTEN[name])
-    found = read_forces(tmp_path / "f.csv")
-    np.testing.assert_allclose(found.time_s, T, atol=1e-9)
-    np.testing.assert_allclose(found.force, F, atol=1e-6)
-    assert found.axes == "xyz"
+    (tmp_path / "f.csv").write_text(TABLES[name])
+    table = read_forces(tmp_path / "f.csv")
+    np.testing.assert_allclose(table.time_s, T, atol=1e-9)
+    np.testing.assert_allclose(table.force, F, atol=1e-6)
+    assert table.axes == "xyz"
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_three_axes_are_read_with_their_times(name: str, tmp_path: Path) -> None
 )
 def test_clocks_of_every_kind(form: str, start: float, tmp_path: Path) -> None:
     (tmp_path / "f.csv").write_text("Time,Fx,Fy,Fz\n" + clock(form))
-    found = read_forces(tmp_path / "f.csv")
-    np.testing.assert_allclose(found.time_s, start + T, atol=2e-6, rtol=0)
+    table = read_forces(tmp_path / "f.csv")
+    np.testing.assert_allclose(table.time_s, start + T, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("unit", ["hh:mm:ss.fff", "UTC"])
@@ -108,12 +108,12 @@ def test_a_clock_in_an_unknown_unit_gives_way_to_another(tmp_path: Path) -> None
 @pytest.mark.parametrize(("day", "ambiguous"), [("05/06/2026", 1), ("05/28/2026", 0), ("05/05/2026", 0)])
 def test_ambiguous_dates_with_am_and_pm_are_said(day: str, ambiguous: int, tmp_path: Path) -> None:
     (tmp_path / "f.csv").write_text("Time,Fx,Fy,Fz\n" + clock(day + " {h}:{m:02d}:{s:06.3f} AM"))
-    found = read_forces(tmp_path / "f.csv")
+    table = read_forces(tmp_path / "f.csv")
     month_first = np.datetime64(f"2026-{day[:2]}-{day[3:5]}", "s").astype(int) + 36_120
-    np.testing.assert_allclose(found.time_s, month_first + T, atol=2e-6, rtol=0)
-    clear = tmp_path / "clear.csv"
-    clear.write_text("Time,Fx,Fy,Fz\n" + clock("2026-05-06 {h}:{m:02d}:{s:06.3f} AM"))
-    assert len(found.notes) - len(read_forces(clear).notes) == ambiguous
+    np.testing.assert_allclose(table.time_s, month_first + T, atol=2e-6, rtol=0)
+    unambiguous_file = tmp_path / "clear.csv"
+    unambiguous_file.write_text("Time,Fx,Fy,Fz\n" + clock("2026-05-06 {h}:{m:02d}:{s:06.3f} AM"))
+    assert len(table.notes) - len(read_forces(unambiguous_file).notes) == ambiguous
 
 
 def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
     file.write_text("date,time,fx,fy,fz\n2026-11-28,23:59:59.9,1,2,3\n2026-11-29,00:00:00.1,1,2,3\n")
     assert read_forces(file).time_s == pytest.approx([DAY_S + 86_399.9, DAY_S + 86_400.1], abs=1e-5)
     # The clock that the pictures have is taken, if there are several.
-    both = rows([f"2026-11-28 10:02:{t:06.3f}", t, *f] for t, f in zip(T, F, strict=True))
-    file.write_text("time,elapsed,fx,fy,fz\n" + both)
+    cells = rows([f"2026-11-28 10:02:{t:06.3f}", t, *f] for t, f in zip(T, F, strict=True))
+    file.write_text("time,elapsed,fx,fy,fz\n" + cells)
     np.testing.assert_allclose(read_forces(file).time_s, T)
     np.testing.assert_allclose(
         read_forces(file, since_1970=True).time_s, DAY_S + 36_120 + T, atol=1e-5, rtol=0
@@ -155,9 +155,9 @@ def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
 def test_units_in_names_are_converted(unit: str, newtons: float, tmp_path: Path) -> None:
     for head in (f"time,Fx ({unit}),Fy [{unit}],Fz_{unit}\n", f"time,Fx,Fy,Fz\ns,{unit},{unit},{unit}\n"):
         (tmp_path / "f.csv").write_text(head + plain())
-        found = read_forces(tmp_path / "f.csv")
-        np.testing.assert_allclose(found.force, newtons * F, atol=1e-6 * newtons)
-        assert found.in_newtons
+        table = read_forces(tmp_path / "f.csv")
+        np.testing.assert_allclose(table.force, newtons * F, atol=1e-6 * newtons)
+        assert table.in_newtons
 
 
 @pytest.mark.parametrize(
@@ -175,27 +175,27 @@ def test_one_axis_or_a_size(header: str, axes: str, place: int, tmp_path: Path) 
     (tmp_path / "f.csv").write_text(
         header + ",other\n" + rows([t, f[1], 7] for t, f in zip(T, F, strict=True))
     )
-    found = read_forces(tmp_path / "f.csv")
-    assert found.axes == axes
-    np.testing.assert_allclose(found.force[:, place], F[:, 1])
-    assert not np.delete(found.force, place, 1).any()
+    table = read_forces(tmp_path / "f.csv")
+    assert table.axes == axes
+    np.testing.assert_allclose(table.force[:, place], F[:, 1])
+    assert not np.delete(table.force, place, 1).any()
 
 
 def test_the_table_of_a_testing_machine(tmp_path: Path) -> None:
     """A title, and units in a quoted row of their own."""
     cells = "".join(f'"{t:.3f}","0.1","{f[1]:.6f}"\n' for t, f in zip(T, F, strict=True))
     (tmp_path / "f.csv").write_text('Results\n"Time","Extension","Load"\n"(sec)","(mm)","(lbf)"\n\n' + cells)
-    found = read_forces(tmp_path / "f.csv")
-    np.testing.assert_allclose(found.force[:, 0], POUND * F[:, 1], atol=1e-5)
+    table = read_forces(tmp_path / "f.csv")
+    np.testing.assert_allclose(table.force[:, 0], POUND * F[:, 1], atol=1e-5)
 
 
 def test_columns_can_be_named(tmp_path: Path) -> None:
     file = tmp_path / "f.csv"
     file.write_text("made by a device\n" + plain())
     np.testing.assert_allclose(read_forces(file, "t_s,fx_n,fy_n,fz_n").force, F, atol=1e-6)
-    found = read_forces(file, "t_s,-,f_mn")
-    assert found.axes == ""
-    np.testing.assert_allclose(found.force[:, 0], F[:, 1] / 1000, atol=1e-9)
+    table = read_forces(file, "t_s,-,f_mn")
+    assert table.axes == ""
+    np.testing.assert_allclose(table.force[:, 0], F[:, 1] / 1000, atol=1e-9)
 
 
 @pytest.mark.parametrize(

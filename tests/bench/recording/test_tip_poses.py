@@ -37,36 +37,38 @@ def test_tips_are_where_opencv_projects_them(tmp_path: Path) -> None:
     write_poses(tmp_path, np.arange(3) / 25, {NAME: poses_of()})
     prior = read_tips(tmp_path / "poses.csv", tips_of(), 0.5)
     for k in (0, 1):
-        seen = prior.expect(k, (120, 160))
+        mask = prior.expect(k, (120, 160))
         place = poses_of()[k, :3, 3]
-        at = cv2.projectPoints(place[None], cv2.Rodrigues(TURN)[0], SHIFT, K, None)[0].ravel()
-        assert seen is not None
-        np.testing.assert_allclose(np.argwhere(seen).mean(axis=0)[::-1], at, atol=0.6)
-        assert seen.sum() < 30  # of 2 px radius
+        tip_px = cv2.projectPoints(place[None], cv2.Rodrigues(TURN)[0], SHIFT, K, None)[0].ravel()
+        assert mask is not None
+        np.testing.assert_allclose(np.argwhere(mask).mean(axis=0)[::-1], tip_px, atol=0.6)
+        assert mask.sum() < 30  # of 2 px radius
     assert prior.expect(2, (120, 160)) is None
     assert prior.expect(7, (120, 160)) is None
 
 
 def test_a_shaft_leads_from_the_tip_to_the_hand(tmp_path: Path) -> None:
     write_poses(tmp_path, np.arange(3) / 25, {NAME: poses_of()})
-    seen = read_tips(tmp_path / "poses.csv", tips_of(axis=[0, 0, 1]), 0.5).expect(0, (120, 160))
+    mask = read_tips(tmp_path / "poses.csv", tips_of(axis=[0, 0, 1]), 0.5).expect(0, (120, 160))
     pose = poses_of()[0]
     for along in (0.0, 10.0, 20.0):
         place = pose[:3, 3] + along * pose[:3, 2]
         x, y = np.rint(cv2.projectPoints(place[None], cv2.Rodrigues(TURN)[0], SHIFT, K, None)[0].ravel())
-        assert seen is not None
+        assert mask is not None
         assert 0 <= x < 160
-        assert seen[int(y), int(x)]
+        assert mask[int(y), int(x)]
     x, y = np.rint(cv2.projectPoints((pose[:3, 3] - 8 * pose[:3, 2])[None], cv2.Rodrigues(TURN)[0], SHIFT, K,
                                      None)[0].ravel())  # fmt: skip
-    assert not seen[int(y), int(x)]
+    assert not mask[int(y), int(x)]
 
 
 def test_odds_are_raised_where_an_instrument_is_expected() -> None:
     flat = np.array([[0.05, 0.5, 0.6, 0.95]], np.float32)
-    found = Segmentation(flat, 0 * flat, 0 * flat)
-    there = found.expect(np.array([[True, True, False, True]])).instrument
-    np.testing.assert_allclose(there, [[9 * 0.05 / (0.95 + 9 * 0.05), 0.9, 0.6, 9 * 0.95 / 8.6]], rtol=1e-5)
+    segmentation = Segmentation(flat, 0 * flat, 0 * flat)
+    instrument = segmentation.expect(np.array([[True, True, False, True]])).instrument
+    np.testing.assert_allclose(
+        instrument, [[9 * 0.05 / (0.95 + 9 * 0.05), 0.9, 0.6, 9 * 0.95 / 8.6]], rtol=1e-5
+    )
     assert not Segmentation(0 * flat, flat, flat).expect(np.ones((1, 4), bool)).instrument.any()
 
 

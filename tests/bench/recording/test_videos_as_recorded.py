@@ -21,7 +21,7 @@ from synth.video.file_numbers import find_stamps, number_files, still_times
 from synth.video.read_video import VideoFile
 
 FPS = 25
-MOVED = [np.roll(texture(96, 128, 1), 2 * k, axis=1) for k in range(20)]
+SHIFTED_FRAMES = [np.roll(texture(96, 128, 1), 2 * k, axis=1) for k in range(20)]
 OTHER = [texture(96, 128, 9)] * 20
 
 
@@ -56,20 +56,25 @@ def mux(
                 frame.time_base = Fraction(1, 48000)
                 packets += sound.encode(frame)
             packets += sound.encode(None)
-        for packet in sorted(packets, key=lambda one: float((one.dts or 0) * one.time_base)):
+        for packet in sorted(packets, key=lambda packet: float((packet.dts or 0) * packet.time_base)):
             out.mux(packet)
     return path
 
 
-def nearest(pictures: Sequence[np.ndarray]) -> list[int]:
-    return [int(np.argmin([np.abs(one.astype(int) - rgb).mean() for rgb in MOVED])) for one in pictures]
+def find_nearest(pictures: Sequence[np.ndarray]) -> list[int]:
+    return [
+        int(np.argmin([np.abs(picture.astype(int) - rgb).mean() for rgb in SHIFTED_FRAMES]))
+        for picture in pictures
+    ]
 
 
 @pytest.mark.parametrize("name", ["v.mp4", "v.mkv", "v.ts"])
 def test_sound_that_begins_first_does_not_move_the_clock(name: str, make: Maker, tmp_path: Path) -> None:
-    source = mux(tmp_path / name, [MOVED], sound_s=0.0)
-    assert [one.time_s for one in video.read_video(source)] == pytest.approx(np.arange(20) / FPS, abs=1e-3)
-    from_file = [one.time_s for one in video.read_video(VideoFile(source, from_file=True))]
+    source = mux(tmp_path / name, [SHIFTED_FRAMES], sound_s=0.0)
+    assert [picture.time_s for picture in video.read_video(source)] == pytest.approx(
+        np.arange(20) / FPS, abs=1e-3
+    )
+    from_file = [picture.time_s for picture in video.read_video(VideoFile(source, from_file=True))]
     assert from_file == pytest.approx(0.5 + np.arange(20) / FPS, abs=0.03)  # the codec's priming is sound too
     folder = make("one", frames=2, footage="mp4")
     (folder / "video.mp4").unlink()
@@ -81,15 +86,15 @@ def test_sound_that_begins_first_does_not_move_the_clock(name: str, make: Maker,
 
 
 def test_covers_are_skipped_and_films_are_chosen(tmp_path: Path) -> None:
-    covered = mux(tmp_path / "c.mkv", [MOVED], cover=True)
-    assert nearest([one.rgb for one in video.read_video(covered)]) == [*range(20)]
-    several = mux(tmp_path / "s.mkv", [OTHER, MOVED])
+    video_with_cover = mux(tmp_path / "c.mkv", [SHIFTED_FRAMES], cover=True)
+    assert find_nearest([picture.rgb for picture in video.read_video(video_with_cover)]) == [*range(20)]
+    two_films = mux(tmp_path / "s.mkv", [OTHER, SHIFTED_FRAMES])
     with pytest.raises(UserError, match="2 films"):
-        next(video.read_video(several))
-    found = importer_registry.read_source(several, {"stream": "1"})
-    assert nearest(list(found.pictures())) == [*range(20)]
+        next(video.read_video(two_films))
+    intake = importer_registry.read_source(two_films, {"stream": "1"})
+    assert find_nearest(list(intake.pictures())) == [*range(20)]
     with pytest.raises(UserError):
-        importer_registry.read_source(several, {"stream": "2"})
+        importer_registry.read_source(two_films, {"stream": "2"})
 
 
 @pytest.mark.parametrize("codec", ["libx264", "mpeg2video"])
@@ -100,44 +105,48 @@ def test_pictures_after_lost_packets_are_lost_until_the_next_whole_one(
         stream = out.add_stream(codec, rate=FPS)
         stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
         stream.options = {"g": "40", "bf": "0", "crf": "8", "b": "4000000"}
-        for rgb in 3 * MOVED:
+        for rgb in 3 * SHIFTED_FRAMES:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
         out.mux(stream.encode(None))
     data = (tmp_path / "v.ts").read_bytes()
     packets, rng = [data[k : k + 188] for k in range(0, len(data), 188)], np.random.default_rng(1)
     count = len(packets)
-    kept = [p for k, p in enumerate(packets) if not 0.2 * count < k < 0.3 * count or rng.random() > 0.3]
+    remaining_packets = [
+        p for k, p in enumerate(packets) if not 0.2 * count < k < 0.3 * count or rng.random() > 0.3
+    ]
     folder = make(frames=2, footage="mp4")
     (folder / "video.mp4").unlink()
-    (folder / "video.ts").write_bytes(b"".join(kept))
-    read = list(video.read_video(folder / "video.ts"))
-    off = np.array(
-        [np.abs(MOVED[round((one.time_s or 0) * FPS) % 20].astype(int) - one.rgb).mean() for one in read]
+    (folder / "video.ts").write_bytes(b"".join(remaining_packets))
+    pictures = list(video.read_video(folder / "video.ts"))
+    errors = np.array(
+        [
+            np.abs(SHIFTED_FRAMES[round((picture.time_s or 0) * FPS) % 20].astype(int) - picture.rgb).mean()
+            for picture in pictures
+        ]
     )
-    damaged = np.array([one.damaged for one in read])
-    timed = np.array([one.time_s is not None for one in read])
-    assert 0 < damaged.sum() < len(read)
+    damaged = np.array([picture.damaged for picture in pictures])
+    timed = np.array([picture.time_s is not None for picture in pictures])
+    assert 0 < damaged.sum() < len(pictures)
     assert not damaged[0]
-    assert off[~damaged & timed].max() < 8, "a picture that isn't marked is as it was taken"
-    assert any(one.severity == "warning" and "damaged" in one.message for one in check_recording(folder))
+    assert errors[~damaged & timed].max() < 8, "a picture that isn't marked is as it was taken"
+    assert any(
+        finding.severity == "warning" and "damaged" in finding.message for finding in check_recording(folder)
+    )
 
 
 def test_a_video_that_ends_early_is_named(make: Maker, tmp_path: Path) -> None:
     with av.open(str(tmp_path / "v.mp4"), "w", options={"movflags": "faststart"}) as out:
         stream = out.add_stream("libx264", rate=FPS, options={"crf": "8", "g": "10"})
         stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
-        for rgb in 4 * MOVED:
+        for rgb in 4 * SHIFTED_FRAMES:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
         out.mux(stream.encode(None))
-    whole = (tmp_path / "v.mp4").read_bytes()
+    data = (tmp_path / "v.mp4").read_bytes()
     folder = make(frames=2, footage="mp4")
-    for share, named in ((1.0, False), (0.6, True)):
-        (folder / "video.mp4").write_bytes(whole[: int(share * len(whole))])
-        found = [
-            one for one in check_recording(folder) if one.severity == "warning" and "ends? at" in one.message
-        ]
-        found += [one for one in check_recording(folder) if "pictures end at" in one.message]
-        assert bool(found) == named
+    for share, is_named in ((1.0, False), (0.6, True)):
+        (folder / "video.mp4").write_bytes(data[: int(share * len(data))])
+        findings = [finding for finding in check_recording(folder) if "pictures end at" in finding.message]
+        assert bool(findings) == is_named
 
 
 @pytest.mark.parametrize(
@@ -151,12 +160,12 @@ def test_a_video_that_ends_early_is_named(make: Maker, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_video_is_refused(content: bytes | None, tmp_path: Path) -> None:
-    recording_writer.write_video(tmp_path / "v.mp4", iter(MOVED), np.arange(20) / FPS)
-    whole = (tmp_path / "v.mp4").read_bytes()
-    (tmp_path / "v.mp4").write_bytes(whole[: len(whole) // 2] if content is None else content)
-    with pytest.raises(UserError) as refused:
+    recording_writer.write_video(tmp_path / "v.mp4", iter(SHIFTED_FRAMES), np.arange(20) / FPS)
+    data = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "v.mp4").write_bytes(data[: len(data) // 2] if content is None else content)
+    with pytest.raises(UserError) as caught:
         next(video.read_video(tmp_path / "v.mp4"))
-    assert "Invalid data" not in str(refused.value)
+    assert "Invalid data" not in str(caught.value)
 
 
 def test_chapters_are_joined_with_their_gaps(tmp_path: Path) -> None:
@@ -170,15 +179,15 @@ def test_chapters_are_joined_with_their_gaps(tmp_path: Path) -> None:
                 out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
             out.mux(stream.encode(None))
 
-    chapter("GX010123.MP4", MOVED[:10])
-    chapter("GX020123.MP4", MOVED[10:])
-    found = importer_registry.read_source(tmp_path)
-    assert found.times_s == pytest.approx(np.arange(20) / FPS, abs=1e-4)
-    assert nearest(list(found.pictures())) == [*range(20)]
-    chapter("GX010123.MP4", MOVED[:10], "2026-11-28T10:00:00Z")
-    chapter("GX020123.MP4", MOVED[10:], "2026-11-28T10:00:30Z")
+    chapter("GX010123.MP4", SHIFTED_FRAMES[:10])
+    chapter("GX020123.MP4", SHIFTED_FRAMES[10:])
+    intake = importer_registry.read_source(tmp_path)
+    assert intake.times_s == pytest.approx(np.arange(20) / FPS, abs=1e-4)
+    assert find_nearest(list(intake.pictures())) == [*range(20)]
+    chapter("GX010123.MP4", SHIFTED_FRAMES[:10], "2026-11-28T10:00:00Z")
+    chapter("GX020123.MP4", SHIFTED_FRAMES[10:], "2026-11-28T10:00:30Z")
     assert importer_registry.read_source(tmp_path).times_s[10] == pytest.approx(30)
-    chapter("GX010124.MP4", MOVED[:10])  # another recording
+    chapter("GX010124.MP4", SHIFTED_FRAMES[:10])  # another recording
     with pytest.raises(UserError, match="GX010124"):
         importer_registry.read_source(tmp_path)
     assert len(importer_registry.read_source(tmp_path, {"frames": "GX0?0123.MP4"}).times_s) == 20
@@ -191,17 +200,19 @@ def test_folders_as_people_keep_them(make: Maker) -> None:
     stills = sorted((folder / "frames").iterdir())
     for k, path in enumerate(stills):
         path.rename(folder / f"frames/{100 * k + 1:06d}.png")  # milliseconds
-    assert [one.time_s for one in open_recording(folder).frames()] == pytest.approx(expected)
+    assert [frame.time_s for frame in open_recording(folder).frames()] == pytest.approx(expected)
     for k, path in enumerate(sorted((folder / "frames").iterdir())):
         cv2.imwrite(str(folder / f"frames/{k:03d}.JPG"), cv2.imread(str(path)))
         path.unlink()
-    assert [one.time_s for one in open_recording(folder).frames()] == pytest.approx(expected)
+    assert [frame.time_s for frame in open_recording(folder).frames()] == pytest.approx(expected)
     (folder / "masks").mkdir()
     for k in range(4):
         mask = np.full((96, 128), 255, np.uint8)
         mask[:20, :30] = 0
         cv2.imwrite(str(folder / f"masks/{k:03d}.png"), mask)
-    assert any(one.cause == "tool" and one.severity == "warning" for one in check_recording(folder))
+    assert any(
+        finding.cause == "tool" and finding.severity == "warning" for finding in check_recording(folder)
+    )
 
 
 @pytest.mark.parametrize("name", ["Video.MP4", "left.mp4", "GX010123.MP4"])

@@ -10,7 +10,7 @@ import fake_intervals
 import numpy as np
 import pytest
 from fake_model import write_model
-from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
+from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, score_recording
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.force_fusion import Fusion
@@ -29,7 +29,7 @@ from synth.flow.recording.flow import LocalFlow
 from synth.flow.recording.frame_motion import FrameMotion
 
 
-class Known(LocalFlow):
+class KnownFlow(LocalFlow):
     """A flow proportional to the force, which loses the given frames."""
 
     def __init__(self, lost: set[int], fps: float = 10.0) -> None:
@@ -46,33 +46,33 @@ class Known(LocalFlow):
         lost = self.frame in self.lost
         flow = np.zeros((*self.shape, 2), np.float32)
         flow[..., 0] = 50 * bump if lost else peak * bump
-        done: Future[FrameMotion] = Future()
-        done.set_result(FrameMotion(flow, np.full(self.shape, 0.1 if lost else 1.0, np.float32), not lost))
-        return done
+        future: Future[FrameMotion] = Future()
+        future.set_result(FrameMotion(flow, np.full(self.shape, 0.1 if lost else 1.0, np.float32), not lost))
+        return future
 
 
 def run(folder: Path, lost: set[int] | None = None, **methods: Method) -> Result:
-    return scored(folder, methods, flow_here=Known(lost or set()))
+    return score_recording(folder, methods, flow_here=KnownFlow(lost or set()))
 
 
 def test_lost_frames_are_not_scored_and_are_gaps_in_the_curves(make: Maker) -> None:
-    whole, some = run(make("whole")), run(make("some"), {7, 8, 20})
-    assert whole.lost.sum() == 0
-    method = some.methods["bump"]
-    assert np.flatnonzero(some.lost).tolist() == [7, 8, 20]
-    assert np.isnan(method.size_mn[some.lost]).all(), "a lost frame has no estimate"
+    complete, partial = run(make("whole")), run(make("some"), {7, 8, 20})
+    assert complete.lost.sum() == 0
+    method = partial.methods["bump"]
+    assert np.flatnonzero(partial.lost).tolist() == [7, 8, 20]
+    assert np.isnan(method.size_mn[partial.lost]).all(), "a lost frame has no estimate"
     # 50 px would be 2 N: it must not be in the average.
     assert method.scores["mae_mn"] < 1
     assert method.scores["n"] == 27
     assert method.scores["dropout"] == pytest.approx(0.1)
-    assert "<svg" in charts.draw_force(some)
-    tree = as_json(some)
+    assert "<svg" in charts.draw_force(partial)
+    tree = as_json(partial)
     assert tree["lost"] == {"frames": 3, "share": 0.1, "most": 0.2}
     assert tree["curve"]["predicted_mn"]["bump"][7] is None
-    assert headline(some).refused == ""
-    assert "tracking" in {one.cause for one in some.findings}
-    assert "frames" in headline(whole).trust
-    assert "frames" not in headline(some).trust, "nothing reassures over a finding"
+    assert headline(partial).refused == ""
+    assert "tracking" in {finding.cause for finding in partial.findings}
+    assert "frames" in headline(complete).trust
+    assert "frames" not in headline(partial).trust, "nothing reassures over a finding"
     most = headline(run(make("most"), set(range(8, 16))))
     assert most.refused
     assert most.tiles == (), "no numbers with over a fifth lost"
@@ -106,7 +106,7 @@ def test_mean_and_peak_length_of_a_flow() -> None:
 
 
 def test_shape_error_of_a_wrong_curve(make: Maker) -> None:
-    result = run(make(), late=lambda *given: ForceEstimate(np.sqrt(Bump()(*given).force_mn)))
+    result = run(make(), late=lambda *inputs: ForceEstimate(np.sqrt(Bump()(*inputs).force_mn)))
     # min over g of mean |g sqrt(x) - x| / mean peak, x being the half-waves.
     x = force_curve(np.arange(30) / 10)
     g = float(x @ np.sqrt(x) / x.sum())
@@ -138,8 +138,8 @@ def test_the_range_of_the_method_that_the_result_is_about_is_a_finding(make: Mak
     folder = make(frames=4)
     for first, second in ((Bump(), Bounded()), (Bounded(), Bump())):
         result = run(folder, first=first, second=second)
-        stated = [finding.message for finding in result.findings if finding.message in Bounded.warnings]
-        assert len(stated) == isinstance(first, Bounded)
+        messages = [finding.message for finding in result.findings if finding.message in Bounded.warnings]
+        assert len(messages) == isinstance(first, Bounded)
         assert f"second: {Bounded.warnings[0]}" in result.notes or isinstance(first, Bounded)
 
 
@@ -149,7 +149,7 @@ def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Make
     folder = make(frames=130, meta=about)
     result = run(folder)
     assert "ambiguous" in result.sync.refused
-    assert "clocks" in {one.cause for one in result.findings}
+    assert "clocks" in {finding.cause for finding in result.findings}
     assert result.methods["bump"].scores["r"] > 0.99, "scored at the stated offset"
 
 
@@ -162,10 +162,10 @@ def test_the_first_screen_has_four_answers_in_few_words(make: Maker) -> None:
         body = re.sub(r"<svg.*?</svg>", "", page[page.index("<body>") :], flags=re.DOTALL)
         screen = re.sub(r"<[^>]+>", " ", body[: body.index("<details")])
         assert len(screen.split()) <= 120
-        four = answer(result)
-        assert ("held back" in four.sure) == bool(result.refused)
-        assert len(four.wrong) <= 3
-        assert bool(result.findings) == (four.wrong != ("nothing found",))
+        answers = answer(result)
+        assert ("held back" in answers.interval) == bool(result.refused)
+        assert len(answers.faults) <= 3
+        assert bool(result.findings) == (answers.faults != ("nothing found",))
 
 
 def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
@@ -175,8 +175,8 @@ def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
     result.tracked.evidence, result.tracked.stated = video, (True, False, True, False)
     gains = find_gains(result, 10.0, 6.0, 14.0)
     ratios = read_table().stating
-    narrower = {"camera": ratios["second camera"] < 0.98, "masks": ratios["statements"] ** 0.5 < 0.98}
-    for word, known in narrower.items():
-        assert any(word in line for line in gains) == known
+    is_narrower = {"camera": ratios["second camera"] < 0.98, "masks": ratios["statements"] ** 0.5 < 0.98}
+    for word, is_known in is_narrower.items():
+        assert any(word in line for line in gains) == is_known
     result.tracked.evidence = replace(video, cameras=2, stated=1.0)
     assert find_gains(result, 10.0, 6.0, 14.0) == ()

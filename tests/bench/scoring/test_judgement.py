@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from fake_recording import Maker, scored, texture
+from fake_recording import Maker, score_recording, texture
 from typer.testing import CliRunner
 
 from bench.checks.check_recording import check_recording
@@ -26,10 +26,10 @@ UNITS = ("young_kpa", 1500.0), ("young_kpa", 0.0015), ("scale_mm_per_px", 2.5e-4
 @pytest.mark.parametrize(("key", "value"), UNITS)
 def test_wrong_units_are_found_by_check_and_score(make: Maker, key: str, value: float) -> None:
     folder, cause = make(frames=6, meta={key: value}), "stiffness" if key == "young_kpa" else "scale"
-    result = scored(folder, backend="dis")
-    wrong = [one for one in result.findings if one.severity == "error"]
-    assert [one.cause for one in wrong] == [cause]
-    assert wrong == [one for one in check_recording(folder) if one.severity == "error"]
+    result = score_recording(folder, backend="dis")
+    errors = [finding for finding in result.findings if finding.severity == "error"]
+    assert [finding.cause for finding in errors] == [cause]
+    assert errors == [finding for finding in check_recording(folder) if finding.severity == "error"]
     assert np.isnan(result.methods["bump"].size_mn).all()
     assert headline(result).tiles == ()
     assert next(iter(as_json(result)["findings"]))["cause"] == cause
@@ -40,10 +40,10 @@ def test_a_refused_score_writes_its_files_and_exits_with_code_2(
     make: Maker, frames: int, young: float, code: int
 ) -> None:
     folder = make(frames=frames, meta={"young_kpa": young})
-    done = CliRunner().invoke(app, ["score", str(folder), "-o", str(folder / "score"), "--flow", "dis"])
-    assert done.exit_code == code, done.output
-    assert ("MAE [mN]" in done.stdout) == (code == 0)  # the table
-    assert {"score.json", "report.html"} == {one.name for one in (folder / "score").iterdir()}
+    result = CliRunner().invoke(app, ["score", str(folder), "-o", str(folder / "score"), "--flow", "dis"])
+    assert result.exit_code == code, result.output
+    assert ("MAE [mN]" in result.stdout) == (code == 0)  # the table
+    assert {"score.json", "report.html"} == {file.name for file in (folder / "score").iterdir()}
     words = [str(folder / "frames"), "--scale", "0.2", "--young", str(young), "-o", str(folder / "p")]
     assert CliRunner().invoke(app, ["estimate", *words]).exit_code == (0 if young < 9 else 2)
 
@@ -54,17 +54,21 @@ def test_load_at_the_rest_frame_or_in_a_free_span_is_found_by_check_and_score(
 ) -> None:
     sensor = {"axes": "camera", "low_pass_hz": None, "free_s": free}
     folder = make(frames=12, meta={"rest_frame": rest, "sensor": sensor})
-    found = [one for one in scored(folder, backend="dis").findings if one.severity == "warning"]
-    loaded = [one for one in found if one.cause == ("rest frame" if rest else "sensor")]
-    assert loaded
-    assert set(loaded) <= set(check_recording(folder))
+    warnings = [
+        finding
+        for finding in score_recording(folder, backend="dis").findings
+        if finding.severity == "warning"
+    ]
+    expected = [finding for finding in warnings if finding.cause == ("rest frame" if rest else "sensor")]
+    assert expected
+    assert set(expected) <= set(check_recording(folder))
 
 
 TIME = np.arange(120) / 10
 PRESS = np.sin(TIME * 1.3)[:, None] ** 2 * [1.0, -2.0, 4.0] + np.sin(TIME)[:, None] ** 4 * [3.0, 1.0, 0.0]
 
 
-def at(time_s: np.ndarray) -> np.ndarray:
+def interpolate_press(time_s: np.ndarray) -> np.ndarray:
     """`PRESS` at other times (T,): (T, 3)."""
     return np.stack([np.interp(time_s, TIME, axis) for axis in PRESS.T], axis=1)
 
@@ -78,23 +82,23 @@ SENSORS = {
     "constant": (0 * PRESS + 2.0, "error", "sensor"),
     "saturated": (PRESS.clip(-9, 2.0), "warning", "sensor"),
     "0.6 s late": (np.roll(PRESS, 6, axis=0), "error", "clocks"),
-    "a clock 8% slow": (at(0.92 * TIME), "error", "clocks"),
-    "stamped 30 for 25": (at(TIME / 1.2), "error", "clocks"),
-    "stamped 30 for 25, and late": (at((TIME - 0.5) / 1.2), "error", "clocks"),
-    "stamped 25 for 30": (at(1.2 * TIME), "error", "clocks"),
-    "stamped 24 for 30": (at(0.8 * TIME), "error", "clocks"),
+    "a clock 8% slow": (interpolate_press(0.92 * TIME), "error", "clocks"),
+    "stamped 30 for 25": (interpolate_press(TIME / 1.2), "error", "clocks"),
+    "stamped 30 for 25, and late": (interpolate_press((TIME - 0.5) / 1.2), "error", "clocks"),
+    "stamped 25 for 30": (interpolate_press(1.2 * TIME), "error", "clocks"),
+    "stamped 24 for 30": (interpolate_press(0.8 * TIME), "error", "clocks"),
     "backwards": (PRESS[::-1], "error", "clocks"),
     "0.5 s of the video missing": (np.concatenate([PRESS[:55], PRESS[50:115]]), "warning", "clocks"),
 }
 
 
-def findings(axes: np.ndarray, methods: list[np.ndarray]) -> set[tuple[str, str]]:
+def find_contradictions(axes: np.ndarray, methods: list[np.ndarray]) -> set[tuple[str, str]]:
     """Severity and cause of findings on a sensor (T, 3) next to the motion of `PRESS` and forces (T, 3), the
     first with an interval of 40%."""
     bounds = np.linalg.norm(methods[0], axis=1)[:, None] * [0.6, 1.4]
-    moved, leading = np.linalg.norm(PRESS, axis=1) ** 0.9, methods[0]
-    sensor = SensorMotion(TIME, axes, moved, tuple(methods), 3, leading, bounds, axes[0])
-    return {(one.severity, one.cause) for check in SENSOR_CHECKS for one in check(sensor)}
+    motion, leading = np.linalg.norm(PRESS, axis=1) ** 0.9, methods[0]
+    sensor = SensorMotion(TIME, axes, motion, tuple(methods), 3, leading, bounds, axes[0])
+    return {(finding.severity, finding.cause) for check in SENSOR_CHECKS for finding in check(sensor)}
 
 
 METHODS = [0.8 * PRESS, 1.2 * PRESS]
@@ -102,19 +106,23 @@ METHODS = [0.8 * PRESS, 1.2 * PRESS]
 
 @pytest.mark.parametrize("case", SENSORS)
 def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
-    wrong, severity, cause = SENSORS[case]
-    assert (severity, cause) in findings(wrong, METHODS)
+    axes, severity, cause = SENSORS[case]
+    assert (severity, cause) in find_contradictions(axes, METHODS)
 
 
 def test_a_sensor_that_agrees_or_is_doubtful_is_no_error() -> None:
-    assert findings(PRESS, METHODS) == set()
-    assert findings(PRESS, [60 * PRESS]) == {("warning", "force")}, "one method may be wrong itself"
+    assert find_contradictions(PRESS, METHODS) == set()
+    assert find_contradictions(PRESS, [60 * PRESS]) == {("warning", "force")}, (
+        "one method may be wrong itself"
+    )
     late = np.roll(PRESS, 6, axis=0)
-    assert findings(late, [0.8 * PRESS]) == {("error", "clocks")}, "the tissue's mean motion shows it too"
+    assert find_contradictions(late, [0.8 * PRESS]) == {("error", "clocks")}, (
+        "the tissue's mean motion shows it too"
+    )
     spiked = PRESS + 400 * (np.arange(len(PRESS)) == 3)[:, None]
     noise = np.random.default_rng(1).normal(0, 0.3, PRESS.shape)
-    for doubtful in (spiked, noise):
-        assert "error" not in {severity for severity, _ in findings(doubtful, METHODS)}
+    for axes in (spiked, noise):
+        assert "error" not in {severity for severity, _ in find_contradictions(axes, METHODS)}
 
 
 def test_two_contacts_suffice_for_a_rate_and_an_offset() -> None:
@@ -124,18 +132,18 @@ def test_two_contacts_suffice_for_a_rate_and_an_offset() -> None:
     axes = np.stack([np.interp((TIME - 0.5) / 0.8333, TIME, axis) for axis in force.T], axis=1)
     methods = 0.9 * axes, 1.1 * axes
     bounds = np.linalg.norm(methods[0], axis=1)[:, None] * [0.6, 1.4]
-    moved = np.linalg.norm(axes, axis=1) ** 0.9
-    sensor = SensorMotion(TIME, force, moved, methods, 3, methods[0], bounds, force[0])
-    found = [one for check in SENSOR_CHECKS for one in check(sensor) if one.cause == "clocks"]
-    assert any("0.8333" in one.message for one in found)
+    motion = np.linalg.norm(axes, axis=1) ** 0.9
+    sensor = SensorMotion(TIME, force, motion, methods, 3, methods[0], bounds, force[0])
+    findings = [finding for check in SENSOR_CHECKS for finding in check(sensor) if finding.cause == "clocks"]
+    assert any("0.8333" in finding.message for finding in findings)
 
 
 def test_a_video_that_starts_under_load_rests_elsewhere() -> None:
     load = np.interp(np.arange(70), [15, 24, 45, 54], [0, 1, 1, 0])
     # Whole, released, and held at the start or at the end, of which the video shows the same.
-    for start, stop, sure in ((0, 70, None), (20, 70, True), (26, 70, False), (0, 45, False)):
-        found = find_other_rest(TIME[: stop - start], np.abs(load - load[start])[start:stop])
-        assert (found and found[1]) == sure, (start, stop)
+    for start, stop, is_certain in ((0, 70, None), (20, 70, True), (26, 70, False), (0, 45, False)):
+        other_rest = find_other_rest(TIME[: stop - start], np.abs(load - load[start])[start:stop])
+        assert (other_rest and other_rest[1]) == is_certain, (start, stop)
 
 
 BLACK = np.zeros((96, 128, 3), np.uint8)
@@ -146,7 +154,7 @@ def test_recordings_without_texture_or_motion_have_no_scores(make: Maker, pictur
     folder = make(frames=4)
     for k in range(4):
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), picture)
-    result = scored(folder, backend="dis")
+    result = score_recording(folder, backend="dis")
     assert result.lost.all()
     assert headline(result).refused
 
@@ -154,7 +162,7 @@ def test_recordings_without_texture_or_motion_have_no_scores(make: Maker, pictur
 def test_a_single_black_frame_is_lost(make: Maker) -> None:
     folder = make(frames=8)
     cv2.imwrite(str(folder / "frames" / "0004.png"), BLACK)
-    result = scored(folder, backend="dis")
+    result = score_recording(folder, backend="dis")
     assert np.flatnonzero(result.lost).tolist() == [4]
 
 

@@ -18,7 +18,7 @@ def score(name: str, mae: float, specimen: str = "", **networks: str) -> dict[st
     def method(value: float) -> dict[str, Any]:
         return {"scores": dict.fromkeys(pool.SCORES) | {"mae_mn": value, "r": 0.9}, "calibrated": {}}
 
-    hashes = {network: {"hash": one} for network, one in networks.items()}
+    hashes = {network: {"hash": network_hash} for network, network_hash in networks.items()}
     methods = {"net": method(mae), "zero": method(4.0)} | {network: method(mae) for network in networks}
     settings = {"meta": {"specimen": specimen}, "networks": hashes}
     about = {"format": "sulcus-score", "format_version": 2, "recording": name, "main": "net", "frames": 10}
@@ -49,9 +49,9 @@ def test_methods_are_identified_by_their_hash(tmp_path: Path) -> None:
     assert list(tree["methods"]) == ["net", "zero", "one"]  # called otherwise in b
     assert tree["methods"]["one"]["scores"]["mae_mn"]["mean"] == 2.0
     assert tree["of_some"] == ["two"]
-    both = [store(tmp_path / name, score(name, 1.0, net=network)) for name, network in ("ax", "by")]
+    folders = [store(tmp_path / name, score(name, 1.0, net=network)) for name, network in ("ax", "by")]
     with pytest.raises(UserError, match=r"net of a.*net of b"):
-        pool.read(both)
+        pool.read(folders)
 
 
 ODD = {"lost": {"share": 0.3, "most": 0.2}}, {"fault": "it never changes"}, {"sync": {"refused": "ambiguous"}}
@@ -59,8 +59,8 @@ ODD = {"lost": {"share": 0.3, "most": 0.2}}, {"fault": "it never changes"}, {"sy
 
 @pytest.mark.parametrize("odd", ODD)
 def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path: Path) -> None:
-    some = score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}
-    tree = pool.pool([some, score("b", 1.0) | odd])
+    scored_tree = score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}
+    tree = pool.pool([scored_tree, score("b", 1.0) | odd])
     assert list(tree["left_out"]) == ["b"]
     assert tree["methods"]["net"]["scores"]["mae_mn"]["mean"] == 5.0
     with pytest.raises(UserError):
@@ -68,13 +68,14 @@ def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path:
 
 
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
-    both, out = [store(tmp_path / f"{name}-score", score(name, 2.0, name)) for name in "ab"], tmp_path / "out"
-    run(app, "pool", *both, "-o", out)
+    folders = [store(tmp_path / f"{name}-score", score(name, 2.0, name)) for name in "ab"]
+    out = tmp_path / "out"
+    run(app, "pool", *folders, "-o", out)
     assert {path.name for path in out.iterdir()} == {"pool.json", "README.md"}
     score_and_pool([tmp_path / name for name in "ab"], 1, tmp_path / "study")
     assert json.loads((tmp_path / "study" / "pool.json").read_text())["recordings"] == ["a", "b"]
     with pytest.raises(UserError, match="given twice"):
-        pool.read([both[0], both[0]])
+        pool.read([folders[0], folders[0]])
     with pytest.raises(UserError, match="no readable score"):
         pool.read([tmp_path])
 

@@ -32,10 +32,10 @@ def recording(
 @pytest.mark.parametrize("lag_s", [-0.5, -0.313, 0.0, 0.04, 0.5])
 @pytest.mark.parametrize("seed", range(3))
 def test_known_lags_within_one_frame(lag_s: float, seed: int) -> None:
-    found = clock_sync.find_offset(*recording(lag_s, seed), search_s=0.7)
-    assert found.refused == ""
-    assert found.offset_s == pytest.approx(lag_s, abs=1 / 25)
-    assert abs(found.offset_s - lag_s) < 5 * max(found.deviation_s, 0.004)
+    offset = clock_sync.find_offset(*recording(lag_s, seed), search_s=0.7)
+    assert offset.refused == ""
+    assert offset.offset_s == pytest.approx(lag_s, abs=1 / 25)
+    assert abs(offset.offset_s - lag_s) < 5 * max(offset.deviation_s, 0.004)
 
 
 def test_periodic_presses_are_ambiguous() -> None:
@@ -52,9 +52,9 @@ def test_intervals_that_were_not_tracked_are_left_out() -> None:
     frames, speed, t, force = recording(0.2)
     lost = np.arange(20, 60)
     speed[lost] = np.nan
-    found = clock_sync.find_offset(frames, speed, t, force, 0.7)
-    assert found.refused == ""
-    assert found.offset_s == pytest.approx(0.2, abs=1 / 25)
+    offset = clock_sync.find_offset(frames, speed, t, force, 0.7)
+    assert offset.refused == ""
+    assert offset.offset_s == pytest.approx(0.2, abs=1 / 25)
     speed[15:] = np.nan
     assert clock_sync.find_offset(frames, speed, t, force, 0.7).refused
 
@@ -63,6 +63,6 @@ def test_undetermined_offsets_are_refused() -> None:
     frames, speed, t, force = recording(0.0)
     noise = np.abs(np.random.default_rng(5).normal(size=len(frames)))
     short = frames[:10], speed[:10]
-    for frame_s, moved in (short, (frames, noise), (frames, 0 * speed), (frames + 100, speed)):
-        assert clock_sync.find_offset(frame_s, moved, t, force, 0.5).refused
+    for frame_s, motion in (short, (frames, noise), (frames, 0 * speed), (frames + 100, speed)):
+        assert clock_sync.find_offset(frame_s, motion, t, force, 0.5).refused
     assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused, "beyond the search"

@@ -93,11 +93,11 @@ def test_a_fault_in_the_reader_ends_the_stream(
 ) -> None:
     monkeypatch.setattr(FakeCapture, "read", lambda self: (True, picture))
     monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
-    broken = Camera(Path("2"))
-    broken._thread.join(5)
-    assert broken._ends
+    faulty_camera = Camera(Path("2"))
+    faulty_camera._thread.join(5)
+    assert faulty_camera._ends
     with pytest.raises(UserError):
-        next(broken.pictures())
+        next(faulty_camera.pictures())
 
 
 def test_names_of_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

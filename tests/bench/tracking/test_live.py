@@ -36,18 +36,20 @@ def pictures(frames: int) -> list[Picture]:
 
 @pytest.mark.slow
 def test_flow_in_another_process_gives_the_same_results_in_order() -> None:
-    def watched(flow: LocalFlow | None) -> list[live.LiveFrame]:
+    def stream_frames(flow: LocalFlow | None) -> list[live.LiveFrame]:
         results: list[live.LiveFrame] = []
         footage = Footage(lambda: pictures(5), "test")
         settings = RecordingFlowSettings("dis", 1, None, False, "none")
         live.stream_video(footage, settings, paced=False, report=results.append, flow=flow)
         return results
 
-    here = watched(None)
+    local_frames = stream_frames(None)
     with closing(FlowProcess()) as process:
-        there = watched(process)
-    assert [one.index for one in there] == [one.index for one in here] == [1, 2, 3, 4]
-    assert [one.largest_px for one in there] == [one.largest_px for one in here]
+        process_frames = stream_frames(process)
+    assert (
+        [frame.index for frame in process_frames] == [frame.index for frame in local_frames] == [1, 2, 3, 4]
+    )
+    assert [frame.largest_px for frame in process_frames] == [frame.largest_px for frame in local_frames]
 
 
 @pytest.mark.parametrize(
@@ -133,9 +135,9 @@ def test_options_that_do_not_fit_the_source_are_refused(words: list[str]) -> Non
 
 
 def test_pictures_of_a_stream_are_shrunk_to_what_a_network_needs() -> None:
-    wide = [Picture(k, k / 25, np.roll(texture(240, 330), k, axis=1)) for k in range(2)]
+    wide_pictures = [Picture(k, k / 25, np.roll(texture(240, 330), k, axis=1)) for k in range(2)]
     settings = RecordingFlowSettings("dis", 0, None, False, "none", LIVE_COLUMNS)
-    stream = live.stream_video(Footage(lambda: wide, "video"), settings, paced=False)
+    stream = live.stream_video(Footage(lambda: wide_pictures, "video"), settings, paced=False)
     assert stream.size == (120, 165)
 
 
@@ -155,7 +157,7 @@ def test_live_estimates_the_same_forces_as_score(tmp_path: Path) -> None:
 
     settings = RecordingFlowSettings(shrink=1, rate_hz=None)
 
-    def streamed(scale: float | str, young: float | None) -> list[float | None]:
+    def stream_forces(scale: float | str, young: float | None) -> list[float | None]:
         frames: list[live.LiveFrame] = []
         live.stream_video(
             Footage(lambda: read_video(folder / "video.mp4"), "video"),
@@ -168,9 +170,9 @@ def test_live_estimates_the_same_forces_as_score(tmp_path: Path) -> None:
         )
         return [frame.force_mn for frame in frames]
 
-    followed = track_recording(open_recording(folder), {"model": Model(model)}, 0.3, settings)
-    scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
-    assert min(scored) > 0
+    tracked = track_recording(open_recording(folder), {"model": Model(model)}, 0.3, settings)
+    expected_mn = [float(np.linalg.norm(force)) for force in tracked.force_mn["model"][1:]]
+    assert min(expected_mn) > 0
     # The stream solves the rest frame once before its start and so begins warm, which changes flow a little.
-    assert streamed(0.3, 1.0) == pytest.approx(scored, rel=0.25)
-    assert streamed("unknown", 5.0) == streamed(32.0 / summary["width"], None)
+    assert stream_forces(0.3, 1.0) == pytest.approx(expected_mn, rel=0.25)
+    assert stream_forces("unknown", 5.0) == stream_forces(32.0 / summary["width"], None)

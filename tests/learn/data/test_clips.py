@@ -28,8 +28,8 @@ def test_force_density_times_cell_times_stiffness_is_the_force(clips: list[Clip]
 def test_displacement_is_in_mm(clips: list[Clip], dataset: Path) -> None:
     flow = Dataset(dataset)[0]["flow"][3]
     largest = np.linalg.norm(flow, axis=2).max() * phantom.SCALE_MM_PER_PX
-    got = np.linalg.norm(clips[0].displacement["ideal"][3], axis=0).max()
-    assert got == pytest.approx(largest, rel=0.1)
+    peak_mm = np.linalg.norm(clips[0].displacement["ideal"][3], axis=0).max()
+    assert peak_mm == pytest.approx(largest, rel=0.1)
     assert not np.array_equal(clips[0].displacement["recovered"][3], clips[0].displacement["ideal"][3])
 
 
@@ -53,14 +53,14 @@ def test_packed_clips_are_equal_and_another_version_packs_anew(
 def test_two_runs_may_pack_the_same_at_once(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Path.rename
+    rename = Path.rename
 
-    def late(part: Path, to: Path) -> Path:
-        monkeypatch.setattr(Path, "rename", real)
+    def rename_late(part: Path, to: Path) -> Path:
+        monkeypatch.setattr(Path, "rename", rename)
         pack(clips[0], to)  # another run finishes meanwhile
-        return real(part, to)
+        return rename(part, to)
 
-    monkeypatch.setattr(Path, "rename", late)
+    monkeypatch.setattr(Path, "rename", rename_late)
     pack(clips[0], tmp_path / "packed")
     assert [path.name for path in tmp_path.iterdir()] == ["packed"]
     np.testing.assert_array_equal(unpack(tmp_path / "packed").density, clips[0].density)
@@ -69,10 +69,10 @@ def test_two_runs_may_pack_the_same_at_once(
 def test_a_full_disk_is_one_line_and_leaves_nothing(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*about: object) -> None:
+    def fail_to_save(*about: object) -> None:
         raise SafetensorError("Error while serializing: I/O error: No space left on device")
 
-    monkeypatch.setattr("learn.data.clips.save_file", full)
+    monkeypatch.setattr("learn.data.clips.save_file", fail_to_save)
     with pytest.raises(UserError):
         pack(clips[0], tmp_path / "packed")
     assert not any(tmp_path.iterdir())
@@ -81,14 +81,14 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
 def test_a_packed_clip_holds_no_file_open_and_one_mapping(clips: list[Clip], tmp_path: Path) -> None:
     """A process may have a thousand files open and 65,530 mappings; datasets have thousands of sequences."""
 
-    def mapped() -> int:
+    def count_mappings() -> int:
         return Path("/proc/self/maps").read_text().count(str(tmp_path))
 
     pack(clips[0], tmp_path / "packed")
     unpack(tmp_path / "packed")
-    before, held = len(os.listdir("/proc/self/fd")), [unpack(tmp_path / "packed") for _ in range(20)]
+    before, unpacked = len(os.listdir("/proc/self/fd")), [unpack(tmp_path / "packed") for _ in range(20)]
     assert len(os.listdir("/proc/self/fd")) == before
-    assert mapped() == len(held)
+    assert count_mappings() == len(unpacked)
 
 
 def test_a_store_without_recovered_flow(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from learn.network.channels import channels, divergence, rotate
 GRID = Grid(64, 36.0)
 
 
-def whole(shape: tuple[int, int], scale: float) -> GridView:
+def view_whole(shape: tuple[int, int], scale: float) -> GridView:
     return GridView(np.ones(shape, bool), scale, GRID)
 
 
@@ -18,39 +18,39 @@ def whole(shape: tuple[int, int], scale: float) -> GridView:
 def test_totals_are_preserved_at_any_scale(shape: tuple[int, int], scale: float) -> None:
     y, x = np.indices(shape)
     blob = np.exp(-((x - shape[1] / 2 - 3) ** 2 + (y - shape[0] / 2) ** 2) * (scale / 3) ** 2)
-    carried = whole(shape, scale).sum(blob)
-    assert carried.sum(dtype=np.float64) == pytest.approx(blob.sum(), rel=1e-4)
+    on_grid = view_whole(shape, scale).sum(blob)
+    assert on_grid.sum(dtype=np.float64) == pytest.approx(blob.sum(), rel=1e-4)
 
 
 @pytest.mark.parametrize(("shape", "scale"), [((300, 400), 0.06), ((72, 72), 0.5), ((36, 36), 1.0)])
 def test_a_linear_field_stays_the_same_field_in_mm(shape: tuple[int, int], scale: float) -> None:
     y, x = np.indices(shape)
     field = 0.02 * (x - (shape[1] - 1) / 2) * scale - 0.01 * (y - (shape[0] - 1) / 2) * scale
-    carried = whole(shape, scale).mean(field)
+    on_grid = view_whole(shape, scale).mean(field)
     node = (np.arange(64) - 31.5) * GRID.pitch_mm
     expected = 0.02 * node[None, :] - 0.01 * node[:, None]
     inner = slice(26, 38)
-    np.testing.assert_allclose(carried[inner, inner], expected[inner, inner], atol=2e-3)
+    np.testing.assert_allclose(on_grid[inner, inner], expected[inner, inner], atol=2e-3)
 
 
 def test_pixels_outside_the_mask_do_not_count() -> None:
     tissue = np.zeros((72, 72), bool)
     tissue[:, 20:] = True
     field = np.where(tissue, 1.0, 1e6)
-    carried = GridView(tissue, 0.5, GRID, (35.5, 35.5)).mean(field)
-    assert set(np.unique(carried)) <= {0.0, 1.0}
+    on_grid = GridView(tissue, 0.5, GRID, (35.5, 35.5)).mean(field)
+    assert set(np.unique(on_grid)) <= {0.0, 1.0}
 
 
 def test_divergence_of_a_stretch_is_the_sum_of_its_strains_up_to_the_masks_edge() -> None:
     mask = torch.zeros(1, 1, 64, 64)
     mask[..., 10:50, 8:56] = 1
     node = ((torch.arange(64) - 31.5) * GRID.pitch_mm).expand(64, 64)
-    got = divergence(torch.stack([0.03 * node, 0.01 * node.T])[None], mask, GRID.pitch_mm)
-    assert torch.all(got[mask == 0] == 0)
-    inner = got[..., 14:46, 12:52]
+    strain = divergence(torch.stack([0.03 * node, 0.01 * node.T])[None], mask, GRID.pitch_mm)
+    assert torch.all(strain[mask == 0] == 0)
+    inner = strain[..., 14:46, 12:52]
     torch.testing.assert_close(inner, torch.full_like(inner, 0.04), rtol=1e-4, atol=1e-5)
     # The published channel has one sign flipped, which would give 0.02.
-    assert got[mask == 1].min() > 0.02
+    assert strain[mask == 1].min() > 0.02
     shift = divergence(torch.full((1, 2, 64, 64), 0.7), mask, GRID.pitch_mm)
     assert shift.abs().max() < 1e-5
 
@@ -80,8 +80,8 @@ def test_turning_turns_vectors_and_leaves_divergence_unchanged(quarter: int, mir
     turn, field = quarter + 4 * mirror, torch.from_numpy(u)[None]
     torch.testing.assert_close(div(rotate(field, turn)), rotate(div(field), turn), atol=1e-5, rtol=0)
     # A field that points outwards everywhere still does.
-    out = torch.from_numpy(np.stack([x, y]).astype(np.float32))[None]
-    torch.testing.assert_close(rotate(out, turn), out, atol=1e-6, rtol=0)
+    outward = torch.from_numpy(np.stack([x, y]).astype(np.float32))[None]
+    torch.testing.assert_close(rotate(outward, turn), outward, atol=1e-6, rtol=0)
 
 
 def test_a_turn_is_counter_clockwise_in_the_picture() -> None:

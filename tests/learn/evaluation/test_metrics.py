@@ -23,7 +23,7 @@ def test_against_torchmetrics() -> None:
     rng = np.random.default_rng(3)
     true = rng.gamma(1.0, 4.0, 500)
     predicted = 0.8 * true + rng.normal(0.5, 1.0, 500)
-    got = agreement(moments(true[:200], predicted[:200]) + moments(true[200:], predicted[200:]))
+    scores = agreement(moments(true[:200], predicted[:200]) + moments(true[200:], predicted[200:]))
     t, p = torch.tensor(true), torch.tensor(predicted)
     for name, metric in {
         "r2": torchmetrics.R2Score(),
@@ -33,11 +33,11 @@ def test_against_torchmetrics() -> None:
     }.items():
         metric.set_dtype(torch.float64)
         metric.update(p, t)
-        assert got[name] == pytest.approx(float(metric.compute()), rel=1e-6), name
+        assert scores[name] == pytest.approx(float(metric.compute()), rel=1e-6), name
     expected = 2 * np.cov(true, predicted, bias=True)[0, 1]
     expected /= true.var() + predicted.var() + (true.mean() - predicted.mean()) ** 2
-    assert got["ccc"] == pytest.approx(expected)
-    assert got["bias"] == pytest.approx((predicted - true).mean())
+    assert scores["ccc"] == pytest.approx(expected)
+    assert scores["bias"] == pytest.approx((predicted - true).mean())
 
 
 def test_contact_centre() -> None:
@@ -61,28 +61,28 @@ def truth(clip: Clip, output: str) -> np.ndarray:
 def summary(clips: list[Clip], output: str, factor: np.ndarray | float) -> dict[str, float]:
     """Scores of the truth times a factor."""
     c = card(clips, output)
-    scores = [score(one, truth(one, output) * factor, c) for one in clips]
+    scores = [score(clip, truth(clip, output) * factor, c) for clip in clips]
     return EvaluationReport(scores).summary()
 
 
 @pytest.mark.parametrize("output", ["vector", "magnitude"])
 def test_scores_of_the_truth_and_of_no_force(clips: list[Clip], output: str) -> None:
-    got = summary(clips, output, 1)
-    assert got["map_r2"] == pytest.approx(1, abs=1e-6)
-    assert got["force_r2_pooled"] == pytest.approx(1, abs=1e-4)
+    scores = summary(clips, output, 1)
+    assert scores["map_r2"] == pytest.approx(1, abs=1e-6)
+    assert scores["force_r2_pooled"] == pytest.approx(1, abs=1e-4)
     for name in ("map_mae", "false_positive_relative", "localisation_mm", "force_bias"):
-        assert got[name] == pytest.approx(0, abs=5e-3), name
-    got = summary(clips, output, 0)
-    assert got["map_r2"] <= 0
-    assert got["force_r2_pooled"] <= 0
-    assert got["false_positive_relative"] == 0
+        assert scores[name] == pytest.approx(0, abs=5e-3), name
+    scores = summary(clips, output, 0)
+    assert scores["map_r2"] <= 0
+    assert scores["force_r2_pooled"] <= 0
+    assert scores["false_positive_relative"] == 0
 
 
 def test_mirrored_forces_score_badly_in_the_components_alone(clips: list[Clip]) -> None:
-    got = summary(clips, "vector", np.array([-1, 1, 1], np.float32)[:, None, None])
-    assert got["map_r2"] == pytest.approx(1, abs=1e-6)
-    assert got["vector_r2"] < 0.7
-    assert got["vector_error_mn"] > 0
+    scores = summary(clips, "vector", np.array([-1, 1, 1], np.float32)[:, None, None])
+    assert scores["map_r2"] == pytest.approx(1, abs=1e-6)
+    assert scores["vector_r2"] < 0.7
+    assert scores["vector_error_mn"] > 0
 
 
 def test_opposite_forces_cancel_in_vectors_and_add_up_in_lengths(clips: list[Clip]) -> None:
@@ -91,9 +91,9 @@ def test_opposite_forces_cancel_in_vectors_and_add_up_in_lengths(clips: list[Cli
     clip = dataclasses.replace(clips[0], density=density, force=np.zeros_like(clips[0].force))
     for output in ("magnitude", "vector"):
         c = card(clips, output)
-        got = score(clip, truth(clip, output), c)
-        np.testing.assert_allclose(got.predicted_mn, got.true_mn, atol=1e-6)
-        assert (got.true_mn[3] > 0.1) == (output == "magnitude")
+        scores = score(clip, truth(clip, output), c)
+        np.testing.assert_allclose(scores.predicted_mn, scores.true_mn, atol=1e-6)
+        assert (scores.true_mn[3] > 0.1) == (output == "magnitude")
 
 
 def rng() -> np.random.Generator:
@@ -106,9 +106,9 @@ def test_specimens_are_resampled_whole() -> None:
     assert (i.low, i.high) == (2.0, 2.0)  # every specimen has both
     i = over_groups([1.0] * 16 + [6.0] * 4, [*"aaaabbbbccccddddeeee"], rng())
     assert (i.low, i.high) == (1.0, 4.0)  # in 19 of 20 draws at most three of five are the odd specimen
-    few = over_groups(values, [*"abcd" * 5], rng())
-    assert few.mean == 2
-    assert np.isnan([few.low, few.high]).all()
+    few_specimens = over_groups(values, [*"abcd" * 5], rng())
+    assert few_specimens.mean == 2
+    assert np.isnan([few_specimens.low, few_specimens.high]).all()
 
 
 def test_pooled_r2_is_of_all_values_and_its_interval_of_whole_sequences() -> None:
@@ -116,17 +116,17 @@ def test_pooled_r2_is_of_all_values_and_its_interval_of_whole_sequences() -> Non
     true = [draw.normal(size=50) * scale for scale in draw.gamma(2, 1, 20)]
     predicted = [t + draw.normal(size=50) * 0.5 for t in true]
     sums = np.array([moments(t, p) for t, p in zip(true, predicted, strict=True)])
-    got = pooled_r2(sums, rng(), draws=8000)
+    estimate = pooled_r2(sums, rng(), draws=8000)
     t, p = np.concatenate(true), np.concatenate(predicted)
-    assert got.mean == pytest.approx(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
+    assert estimate.mean == pytest.approx(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
 
     def r2(i: np.ndarray) -> float:
         t, p = np.concatenate([true[k] for k in i]), np.concatenate([predicted[k] for k in i])
         return float(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
 
-    how: dict[str, Any] = {"n_resamples": 2000, "method": "BCa", "vectorized": False, "rng": rng()}
-    theirs = stats.bootstrap((np.arange(20),), r2, **how).confidence_interval
-    assert (got.low, got.high) == pytest.approx((theirs.low, theirs.high), abs=0.02)
+    options: dict[str, Any] = {"n_resamples": 2000, "method": "BCa", "vectorized": False, "rng": rng()}
+    theirs = stats.bootstrap((np.arange(20),), r2, **options).confidence_interval
+    assert (estimate.low, estimate.high) == pytest.approx((theirs.low, theirs.high), abs=0.02)
     assert np.isnan(pooled_r2(sums[:2], rng()).low)
-    still = np.array([moments(np.zeros(4), np.ones(4))] * 4)
-    assert np.isnan(pooled_r2(still, rng()).mean), "R² needs force"
+    rest_sums = np.array([moments(np.zeros(4), np.ones(4))] * 4)
+    assert np.isnan(pooled_r2(rest_sums, rng()).mean), "R² needs force"

@@ -33,8 +33,8 @@ def estimate(
 ) -> tuple[FrameForce, list[str]]:
     """The force and the notes on its interval."""
     estimator = ForceEstimator(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
-    found = estimator.estimate(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
-    return found, estimator.interval_notes
+    frame_force = estimator.estimate(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
+    return frame_force, estimator.interval_notes
 
 
 @pytest.fixture
@@ -44,11 +44,11 @@ def vector(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
 def test_bounds_are_those_of_the_card_in_mn(vector: Path, young_kpa: float | None) -> None:
-    found, notes = estimate(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa)
-    force, young = found.force_mn, young_kpa or 1.0
+    frame_force, notes = estimate(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa)
+    force, young = frame_force.force_mn, young_kpa or 1.0
     size = np.linalg.norm(force)
     for level, factor in fake_intervals.FACTORS.items():
-        band = found.bands[float(level)]
+        band = frame_force.bands[float(level)]
         assert band.high[0] == pytest.approx(size + 5 * young * factor)
         assert band.low[0] == pytest.approx(max(size - 5 * young * factor, 0))
         assert band.axes_high[0] - force == pytest.approx(factor * young * np.array([3, 4, 50]))
@@ -65,11 +65,11 @@ def test_without_direction_components_are_around_zero(tmp_path: Path) -> None:
 
 def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> None:
     limit = 0.1
-    found, notes = estimate(fake_intervals.give(vector, fake_intervals.make(frame_limit=limit)))
-    distance = abs(found.map.motion[0])
+    frame_force, notes = estimate(fake_intervals.give(vector, fake_intervals.make(frame_limit=limit)))
+    distance = abs(frame_force.map.motion[0])
     # From 1 mm; half of the tissue moved.
     assert distance == pytest.approx(abs(np.log(0.4 * np.sqrt(0.5) + 0.005)), rel=0.03)
-    wider = found.bands[0.68].high[0] - np.linalg.norm(found.force_mn)
+    wider = frame_force.bands[0.68].high[0] - np.linalg.norm(frame_force.force_mn)
     assert wider == pytest.approx(10 * distance / limit)
     assert len(notes) == 1
     assert "log motion (low)" in notes[0]
@@ -81,9 +81,9 @@ def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> N
 @pytest.mark.parametrize("output", ["vector", "magnitude"])
 def test_fitting_and_estimation_use_the_same_force(output: str, tmp_path: Path) -> None:
     folder = write_model(tmp_path / "model", f"arch.output={output}")
-    (moved, _), (still, _) = estimate(folder), estimate(folder, 0.0)
-    found = net_force(moved.map.density[None], still.map.density[None], moved.map.grid)
-    assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
+    (loaded, _), (unloaded, _) = estimate(folder), estimate(folder, 0.0)
+    force = net_force(loaded.map.density[None], unloaded.map.density[None], loaded.map.grid)
+    assert force[0] == pytest.approx(loaded.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
 
 
 def test_the_force_at_rest_is_subtracted_and_a_size_is_not_negative() -> None:
@@ -95,11 +95,11 @@ def test_the_force_at_rest_is_subtracted_and_a_size_is_not_negative() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [("force_unit", -1.0), ("features", ("log motion",)), ("precision", ((1.0, 0.0),))]
+    "change", [("force_unit", -1.0), ("features", ("log motion",)), ("precision", ((1.0, 0.0),))]
 )
-def test_invalid_intervals_are_refused(vector: Path, wrong: tuple[str, Any]) -> None:
+def test_invalid_intervals_are_refused(vector: Path, change: tuple[str, Any]) -> None:
     intervals = fake_intervals.make()
-    object.__setattr__(intervals.distribution if wrong[0] == "precision" else intervals, *wrong)
+    object.__setattr__(intervals.distribution if change[0] == "precision" else intervals, *change)
     fake_intervals.give(vector, intervals)
     with pytest.raises(UserError, match=r"config\.json.*intervals"):
         read_card(vector)
@@ -112,8 +112,8 @@ _GRID = Grid(32, 36.0)
 
 def _bump(x: float, y: float, height: float = 4.0) -> NDArray[np.float32]:
     rows, columns = np.mgrid[: _WIDE.shape[0], : _WIDE.shape[1]]
-    near = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 15.0**2))
-    return np.stack([height * near, 0.5 * height * near], -1).astype(np.float32)
+    gaussian = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 15.0**2))
+    return np.stack([height * gaussian, 0.5 * height * gaussian], -1).astype(np.float32)
 
 
 def test_grid_that_covers_the_tissue_stays_in_its_middle() -> None:
@@ -137,18 +137,18 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     """The same contact, far off the middle of a wide picture and alone on a picture as wide as the grid."""
     predictor = load_model(write_model(tmp_path / "model", "arch.output=vector"))
     estimator = ForceEstimator(predictor, _WIDE, _MM_PER_PX, 1.0)
-    moved = _bump(370, 120)
-    found = estimator.estimate(FrameMotion(moved, np.ones(_WIDE.shape, np.float32)))
-    force = found.force_mn
+    motion = _bump(370, 120)
+    frame_force = estimator.estimate(FrameMotion(motion, np.ones(_WIDE.shape, np.float32)))
+    force = frame_force.force_mn
     x, y = (round(2 * value) / 2 for value in estimator.placement.centre_px)
     half = round(predictor.grid.extent_mm / _MM_PER_PX / 2)
     top, left = round(y + 0.5) - half, round(x + 0.5) - half
     cut = slice(top, top + 2 * half), slice(left, left + 2 * half)
-    part = FrameMotion(moved[cut], np.ones(moved[cut].shape[:2], np.float32))
+    part = FrameMotion(motion[cut], np.ones(motion[cut].shape[:2], np.float32))
     alone = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0).estimate(part).force_mn
     assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
-    middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
+    middle = predictor(motion, _WIDE, _MM_PER_PX, 1.0).force_mn
     ignoring = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0, "intact")
     assert np.array_equal(ignoring.estimate(part).force_mn, alone)
-    assert [len(one.notes) for one in (estimator, ignoring)] == [1, 1]
-    assert float(np.linalg.norm(middle - found.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))
+    assert [len(candidate.notes) for candidate in (estimator, ignoring)] == [1, 1]
+    assert float(np.linalg.norm(middle - frame_force.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))

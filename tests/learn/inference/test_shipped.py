@@ -39,8 +39,8 @@ def pack(models: Path, name: str, *changes: str) -> Path:
 def test_a_packed_model_is_equal(models: Path) -> None:
     folder = pack(models, "stereo", "arch.output=vector")
     assert {path.name for path in folder.iterdir()} == set(FILES)
-    both = (models.parent / "trained-stereo", folder)
-    before, after = (checkpoint.read_model(one)[0].state_dict() for one in both)
+    folders = (models.parent / "trained-stereo", folder)
+    before, after = (checkpoint.read_model(model_folder)[0].state_dict() for model_folder in folders)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
     row = json.loads(run(app, "models", "--json").stdout)[0]
@@ -49,10 +49,10 @@ def test_a_packed_model_is_equal(models: Path) -> None:
 
 def test_the_pretrained_network_predicts_the_same_as_before() -> None:
     model, card = checkpoint.read_model(shipped_networks.MODELS / "stereo")
-    given = np.random.default_rng(0).random((1, len(card.settings.arch.channels), 128, 128), np.float32)
+    inputs = np.random.default_rng(0).random((1, len(card.settings.arch.channels), 128, 128), np.float32)
     with torch.no_grad():
-        found = model(torch.from_numpy(given))[0].sum(dim=(1, 2))
-    np.testing.assert_allclose(found, [-4.8721, 52.614, 4.4076], rtol=1e-3)
+        force = model(torch.from_numpy(inputs))[0].sum(dim=(1, 2))
+    np.testing.assert_allclose(force, [-4.8721, 52.614, 4.4076], rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", shipped_networks.NAMES)

@@ -46,9 +46,9 @@ def test_relative_twice_the_motion_is_twice_the_force(depth: bool) -> None:
     x = torch.randn(2, len(arch.channels), 32, 32)
     flags = [3, 5, 7] if depth else [3, 5]
     x[:, flags] = (torch.rand(2, len(flags), 32, 32) > 0.3).float()
-    twice = x * 2
-    twice[:, flags] = x[:, flags]
+    doubled = x * 2
+    doubled[:, flags] = x[:, flags]
     with torch.no_grad():
-        one, two = net(x), net(twice)
-    assert one.abs().max() > 0.1
-    torch.testing.assert_close(two, 2 * one, rtol=1e-3, atol=1e-4)
+        force, doubled_force = net(x), net(doubled)
+    assert force.abs().max() > 0.1
+    torch.testing.assert_close(doubled_force, 2 * force, rtol=1e-3, atol=1e-4)

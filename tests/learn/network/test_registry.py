@@ -37,22 +37,22 @@ def by_pytorch(folder: Path, inputs: list[Tensor]) -> np.ndarray:
 
 
 def by_onnx(predictor: Predictor, inputs: list[Tensor]) -> np.ndarray:
-    named = dict(zip(input_names(predictor.card), (each.numpy() for each in inputs), strict=True))
+    named = dict(zip(input_names(predictor.card), (tensor.numpy() for tensor in inputs), strict=True))
     states = [STATES[int(k)] for k in named.get("membrane", np.zeros(len(named["displacement"])))]
 
     def run(k: slice, state: MembraneState) -> np.ndarray:
-        sure = named["confidence"][k] if "confidence" in named else None
-        return predictor.density(named["displacement"][k], named["mask"][0, 0], 1.0, sure, state)
+        confidence = named["confidence"][k] if "confidence" in named else None
+        return predictor.density(named["displacement"][k], named["mask"][0, 0], 1.0, confidence, state)
 
     if len(set(states)) == 1:
         return run(slice(None), states[0])
     return np.concatenate([run(slice(k, k + 1), state) for k, state in enumerate(states)])
 
 
-def assert_equal(got: np.ndarray, expected: np.ndarray) -> None:
+def assert_equal(actual: np.ndarray, expected: np.ndarray) -> None:
     largest = np.abs(expected).max()
     assert largest > 0
-    np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE * largest)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=TOLERANCE * largest)
 
 
 @pytest.mark.parametrize("name", shipped_networks.NAMES)

@@ -33,20 +33,20 @@ SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
     ],
 )
 def test_terms_by_hand(kind: str, error: float, r2: float, off_target: float) -> None:
-    found = float(loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0, total=100.0))
-    assert found == pytest.approx(error + r2 + off_target, rel=1e-5)
+    value = float(loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0, total=100.0))
+    assert value == pytest.approx(error + r2 + off_target, rel=1e-5)
     assert torch.isfinite(loss(PREDICTED, 0 * TRUE, MASK, kind, 4.0, 2.0, 100.0)), "a batch at rest"
 
 
 def test_a_frame_of_much_force_is_not_weighted() -> None:
-    found = float(loss(PREDICTED, TRUE, MASK, "antighost-frame", unit=4.0, spread=2.0, total=80.0))
-    assert found == pytest.approx(0.7 * SQUARED + 0.3 * R2, rel=1e-5)
+    value = float(loss(PREDICTED, TRUE, MASK, "antighost-frame", unit=4.0, spread=2.0, total=80.0))
+    assert value == pytest.approx(0.7 * SQUARED + 0.3 * R2, rel=1e-5)
 
 
 def test_the_off_target_penalty_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
     off_target = [
-        float(loss(PREDICTED, TRUE, MASK, "off-target", 4.0, 2.0, 100.0, at)) - 0.5 * (SQUARED + R2)
-        for at in (0.2, 0.5, 0.75, 1.0)
+        float(loss(PREDICTED, TRUE, MASK, "off-target", 4.0, 2.0, 100.0, progress)) - 0.5 * (SQUARED + R2)
+        for progress in (0.2, 0.5, 0.75, 1.0)
     ]
     assert off_target == pytest.approx([0, off_target[3] / 2, off_target[3], off_target[3]], abs=1e-5)
 
@@ -57,8 +57,8 @@ def test_r2_is_that_of_torchmetrics_and_drops_with_bias() -> None:
     mask = torch.ones(2, 1, 8, 8)
     metric = torchmetrics.R2Score()
     metric.update(predicted.flatten(), true.flatten())
-    found = float(1 - measure_unexplained(predicted, true, mask, 1.0))
-    assert found == pytest.approx(float(metric.compute()), rel=1e-4)
+    r2 = float(1 - measure_unexplained(predicted, true, mask, 1.0))
+    assert r2 == pytest.approx(float(metric.compute()), rel=1e-4)
     assert float(measure_unexplained(true + 1, true, mask, 1.0)) > 0.5
 
 
@@ -69,16 +69,16 @@ def test_r2_by_frame_weighs_weak_and_strong_frames_equally() -> None:
     ones = torch.ones(2, 1, 8, 8)
     weak = pair * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1)
     strong = pair * torch.tensor([0.5, 1.0]).view(2, 1, 1, 1)
-    both = [
+    by_frame = [
         float(measure_unexplained(predicted, pair, ones, 1.0, by_frame=True)) for predicted in (weak, strong)
     ]
-    assert both[0] == pytest.approx(both[1], rel=1e-4)
-    whole = [float(measure_unexplained(predicted, pair, ones, 1.0)) for predicted in (weak, strong)]
-    assert whole[1] == pytest.approx(4 * whole[0], rel=1e-4)
-    alone = [
+    assert by_frame[0] == pytest.approx(by_frame[1], rel=1e-4)
+    pooled = [float(measure_unexplained(predicted, pair, ones, 1.0)) for predicted in (weak, strong)]
+    assert pooled[1] == pytest.approx(4 * pooled[0], rel=1e-4)
+    single_frames = [
         float(measure_unexplained(s[None], p[None], ones[:1], 1.0)) for s, p in zip(weak, pair, strict=True)
     ]
-    assert both[0] == pytest.approx(sum(alone) / 2, rel=1e-4)
+    assert by_frame[0] == pytest.approx(sum(single_frames) / 2, rel=1e-4)
 
 
 def test_the_length_of_a_zero_vector_has_a_gradient() -> None:

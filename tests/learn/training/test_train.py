@@ -43,9 +43,9 @@ def test_killed_and_resumed_equals_uninterrupted(clips: list[Clip], model: Path,
     with pytest.raises(KeyboardInterrupt):
         train(clips, SPLIT, small(input="mixed"), out, log=kill)
     card = train(clips, SPLIT, small(input="mixed"), out)
-    whole, resumed = (checkpoint.read_tensors(folder / "last.pt")["model"] for folder in (model, out))
+    uninterrupted, resumed = (checkpoint.read_tensors(folder / "last.pt")["model"] for folder in (model, out))
     for name, value in resumed.items():
-        assert torch.equal(value, whole[name]), name
+        assert torch.equal(value, uninterrupted[name]), name
     assert (out / "history.jsonl").read_text() == (model / "history.jsonl").read_text()
     assert card == checkpoint.read_card(model)
 
@@ -65,8 +65,8 @@ def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.
 def test_sequences_of_training_brains_are_not_scored(clips: list[Clip], model: Path) -> None:
     card = checkpoint.read_card(model)
     assert [c.name for c in keep_unseen(clips, card)] == [clips[i].name for i in SPLIT.test]
-    copied = dataclasses.replace(clips[SPLIT.fit[0]], content_hash="x")
-    assert keep_unseen([copied], card) == []
+    clip_copy = dataclasses.replace(clips[SPLIT.fit[0]], content_hash="x")
+    assert keep_unseen([clip_copy], card) == []
 
 
 def test_prediction_from_a_picture_equals_that_on_the_grid(
@@ -74,15 +74,15 @@ def test_prediction_from_a_picture_equals_that_on_the_grid(
 ) -> None:
     predictor = load_model(model)
     sequence = Dataset(dataset)[4]
-    given = sequence["flow"][3], sequence["tissue"][:], sequence.attrs["scale_mm_per_px"]
-    map_ = predictor(*given, sequence.attrs["young_kpa"])
+    inputs = sequence["flow"][3], sequence["tissue"][:], sequence.attrs["scale_mm_per_px"]
+    map_ = predictor(*inputs, sequence.attrs["young_kpa"])
     on_grid = predictor.density(clips[4].displacement["ideal"][3:4], clips[4].mask, clips[4].young_kpa)[0]
     np.testing.assert_allclose(map_.density, on_grid, rtol=1e-4, atol=1e-7)
     assert map_.total_force_mn == pytest.approx(float(np.linalg.norm(map_.force_mn)))
-    guessed = predictor(*given)
-    assert guessed.young_kpa == predictor.card.typical_young_kpa
-    expected = map_.total_force_mn * guessed.young_kpa / map_.young_kpa
-    assert guessed.total_force_mn == pytest.approx(expected, rel=1e-4)
+    guess = predictor(*inputs)
+    assert guess.young_kpa == predictor.card.typical_young_kpa
+    expected = map_.total_force_mn * guess.young_kpa / map_.young_kpa
+    assert guess.total_force_mn == pytest.approx(expected, rel=1e-4)
 
 
 def test_force_does_not_depend_on_the_resolution(model: Path) -> None:
@@ -92,8 +92,8 @@ def test_force_does_not_depend_on_the_resolution(model: Path) -> None:
         node = (np.arange(size) - (size - 1) / 2) * scale
         x, y = np.meshgrid(node, node)
         tissue = x**2 + y**2 < 11**2
-        moved = np.stack([np.exp(-(x**2 + y**2) / 30), 0 * x], axis=-1) * 0.5 / scale
-        return predictor((moved * tissue[..., None]).astype(np.float32), tissue, scale, 1.0).total_force_mn
+        flow = np.stack([np.exp(-(x**2 + y**2) / 30), 0 * x], axis=-1) * 0.5 / scale
+        return predictor((flow * tissue[..., None]).astype(np.float32), tissue, scale, 1.0).total_force_mn
 
     assert force(240, 0.15) == pytest.approx(force(120, 0.3), rel=0.05)
 
@@ -114,17 +114,17 @@ def test_surface_motion_is_added_to_half_of_the_frames_without_force(clips: list
     frames = FrameDataset(clips, settings)
     items = [FrameItem(c, t, "ideal") for c in range(len(clips)) for t in range(clips[c].frames)]
     still = frames.batch(items)
-    moved = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
-    added = (moved.displacement - still.displacement).abs()
+    augmented = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
+    added = (augmented.displacement - still.displacement).abs()
     assert (added * (1 - still.mask)).max() == 0
     touched = added.amax((1, 2, 3)) > 0
     assert 0.2 < touched.float().mean() < 0.8
     size = float((added[touched] ** 2).sum() / (still.mask.expand_as(added)[touched]).sum()) ** 0.5
     assert 0.05 < size < 0.5  # a third of 0.5 mm across the view
     for name in ("mask", "confidence", "target"):
-        assert torch.equal(getattr(moved, name), getattr(still, name))
-    again = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
-    assert torch.equal(again.displacement, moved.displacement)
+        assert torch.equal(getattr(augmented, name), getattr(still, name))
+    repeated = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
+    assert torch.equal(repeated.displacement, augmented.displacement)
 
 
 GAINS = (0.8, 8, 1.0, 1.5), (0.8, 7, 1.0, 1.0), (2.0, 8, 0.67, 0.67)
@@ -148,23 +148,23 @@ def test_the_force_gain_corrects_an_underestimate(
 
     monkeypatch.setattr("learn.training.train.forward", forward)
     select = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
-    chosen = FrameDataset(select, settings)
-    found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings))
+    selection = FrameDataset(select, settings)
+    scores = select_score(torch.nn.Identity(), selection, measure_scales(clips, settings))
     vectors = [
         np.reshape(values, (len(select), -1, settings.arch.components)) for values in (true, predicted)
     ]
     sequences = [(t, p) for t, p in zip(*vectors, strict=True) if t.any()]
 
     def error(gain: float) -> float:
-        off = [(gain * p - t, t) for t, p in sequences]
+        errors = [(gain * p - t, t) for t, p in sequences]
         return float(
-            np.mean([np.linalg.norm(e, axis=1).sum() / np.linalg.norm(t, axis=1).sum() for e, t in off])
+            np.mean([np.linalg.norm(e, axis=1).sum() / np.linalg.norm(t, axis=1).sum() for e, t in errors])
         )
 
-    tried = np.linspace(0.3, 3, 2701)
-    best = tried[np.argmin([error(gain) for gain in tried])]
-    assert found["select_gain"] == pytest.approx(np.clip(best, low, high), rel=0.02)
-    assert low == high or low < best < high, "else the limits are tested twice"
+    gains = np.linspace(0.3, 3, 2701)
+    best_gain = gains[np.argmin([error(gain) for gain in gains])]
+    assert scores["select_gain"] == pytest.approx(np.clip(best_gain, low, high), rel=0.02)
+    assert low == high or low < best_gain < high, "else the limits are tested twice"
 
 
 @pytest.mark.parametrize(("change", "key"), [("bacth=3", "'batch'"), ("arch.depth=true", "arch.depth")])
@@ -176,6 +176,6 @@ def test_invalid_settings_are_refused(change: str, key: str) -> None:
 def test_settings_may_stand_anywhere_and_need_a_value() -> None:
     words = ["--epochs", "3", "data", "--seed=1", "loss=mse", "seed=2"]
     assert as_changes(words) == ({"epochs": "3", "seed": "2", "loss": "mse"}, ["data"])
-    for broken in (["--compile", "--epochs", "3"], ["data", "--epochs"]):
+    for incomplete in (["--compile", "--epochs", "3"], ["data", "--epochs"]):
         with pytest.raises(UserError):
-            as_changes(broken)
+            as_changes(incomplete)

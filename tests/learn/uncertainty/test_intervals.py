@@ -32,17 +32,21 @@ def draw(rng: np.random.Generator, directed: bool = True) -> tuple[Prediction, F
     return Prediction(motion, estimate, np.abs(share[..., None]).astype(np.float32) * true, PITCH_MM), force
 
 
-def fitted(rng: np.random.Generator, count: int = 19, directed: bool = True, per_unit: int = 1) -> Intervals:
+def fit_intervals(
+    rng: np.random.Generator, count: int = 19, directed: bool = True, per_unit: int = 1
+) -> Intervals:
     """Intervals with factors from `count` sequences; error models and distribution are from others."""
     first = [make_example(*draw(rng, directed), k, UNIT_MN) for k in range(30)]
     last = [make_example(*draw(rng, directed), k // per_unit, UNIT_MN) for k in range(count)]
-    distribution = fit_distribution([draw(rng)[0].motion for _ in range(60)], [one.motion for one in first])
+    distribution = fit_distribution(
+        [draw(rng)[0].motion for _ in range(60)], [example.motion for example in first]
+    )
     return fit(first, last, distribution, MOTION, UNIT_MN, "recovered")
 
 
-def coverage(found: Intervals, estimate: Prediction, force: Floats, level: float) -> Floats:
+def coverage(intervals: Intervals, estimate: Prediction, force: Floats, level: float) -> Floats:
     """Coverage of size, x, y and z."""
-    band = found.bound(estimate, level)
+    band = intervals.bound(estimate, level)
     size = np.linalg.norm(force, axis=1)
     axes = (force >= band.axes_low) & (force <= band.axes_high)
     return np.array([((size >= band.low) & (size <= band.high)).mean(), *axes.mean(0)])
@@ -54,11 +58,11 @@ def test_new_sequences_are_covered_at_the_nominal_level(directed: bool) -> None:
     rng = np.random.default_rng(int(directed))
     shares: dict[float, list[Floats]] = {level: [] for level in LEVELS}
     for _ in range(60):
-        found = fitted(rng, directed=directed)
+        intervals = fit_intervals(rng, directed=directed)
         for _ in range(10):
             estimate, truth = draw(rng, directed)
             for level in LEVELS:
-                shares[level].append(coverage(found, estimate, truth, level))
+                shares[level].append(coverage(intervals, estimate, truth, level))
     for level, rows in shares.items():
         by_fit = np.array(rows).reshape(60, 10, 4).mean(1)
         error = by_fit.std(0) / np.sqrt(60)
@@ -69,10 +73,10 @@ def test_new_sequences_are_covered_at_the_nominal_level(directed: bool) -> None:
 
 def test_an_interval_contains_the_estimate_and_sizes_are_not_negative() -> None:
     rng = np.random.default_rng(2)
-    found = fitted(rng)
+    intervals = fit_intervals(rng)
     for _ in range(20):
         estimate, _ = draw(rng)
-        wide, narrow = (found.bound(estimate, level) for level in LEVELS)
+        wide, narrow = (intervals.bound(estimate, level) for level in LEVELS)
         ends = np.array([0 * wide.low, wide.low, narrow.low, estimate.size, narrow.high, wide.high])
         assert (np.diff(ends, axis=0) >= 0).all()
         assert ((wide.axes_low < estimate.force) & (estimate.force < wide.axes_high)).all()
@@ -80,8 +84,8 @@ def test_an_interval_contains_the_estimate_and_sizes_are_not_negative() -> None:
 
 def test_sequences_of_one_brain_are_one_unit_and_too_few_are_refused() -> None:
     rng = np.random.default_rng(8)
-    found = fitted(rng, count=9)
-    assert (found.units, found.sequences) == (9, 9)
+    intervals = fit_intervals(rng, count=9)
+    assert (intervals.units, intervals.sequences) == (9, 9)
     for count, per_unit in ((8, 1), (24, 3)):
         with pytest.raises(UserError, match="8"):
-            fitted(rng, count=count, per_unit=per_unit)
+            fit_intervals(rng, count=count, per_unit=per_unit)

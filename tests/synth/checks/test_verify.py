@@ -28,18 +28,18 @@ JOB = Job(seed=1, sequences=2, frames=5, render=PAIR, flow={"backend": "ideal"})
 
 
 @pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pristine") / "out"
     in_process(JOB, root, fake_work.consistent)
     return root
 
 
 @pytest.fixture
-def dataset(pristine: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(pristine, tmp_path / "out"))
+def dataset(good_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(good_dataset, tmp_path / "out"))
 
 
-def failing(root: Path, fast: bool = False) -> set[str]:
+def list_faults(root: Path, fast: bool = False) -> set[str]:
     return {check.name for check in verify.verify_dataset(root, fast=fast).checks if check.bad}
 
 
@@ -62,98 +62,100 @@ FAULTS |= {"stereo": ("motion", "disparity", "right_flow", "right_depth"), "forw
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("check", "fault"), [(check, one) for check, some in FAULTS.items() for one in some])
+@pytest.mark.parametrize(
+    ("check", "fault"), [(check, fault) for check, faults in FAULTS.items() for fault in faults]
+)
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:
     # A monocular job has recovered flow without recovered motion in space, which `fake_work` doesn't make.
     monocular = Job(seed=1, sequences=1, frames=5, render={"size": (96, 72)})
     job = monocular if fault == "recovered_rest" else JOB.model_copy(update={"sequences": 1})
     in_process(job, tmp_path / "out", fake_work.wrong(fault))
-    found = next(one for one in verify.verify_dataset(tmp_path / "out").checks if one.name == check)
-    assert found.bad
-    assert found.offender.startswith("000000.zarr: ")
-    assert found.cpu_s > 0
+    result = next(result for result in verify.verify_dataset(tmp_path / "out").checks if result.name == check)
+    assert result.bad
+    assert result.offender.startswith("000000.zarr: ")
+    assert result.cpu_s > 0
     # Checks of integrity pass, as the files are as they were written.
-    assert not failing(tmp_path / "out") & {"checksum", "seal", "schema", "readable", "dataset", "finite"}
+    assert not list_faults(tmp_path / "out") & {"checksum", "seal", "schema", "readable", "dataset", "finite"}
 
 
 def test_what_had_nothing_to_check_is_not_counted_as_good(tmp_path: Path) -> None:
     job = Job(seed=1, sequences=1, frames=5, render={"size": (96, 72)}, flow={"backend": "ideal"})
     in_process(job, tmp_path / "out", fake_work.wrong("still"))
     report = verify.verify_dataset(tmp_path / "out", fast=True)
-    empty = {check.name: sum(check.why.values()) for check in report.checks if not check.count}
-    assert empty == {"checksum": 1, "force": 1, "compliance": 1, "contact": 1, "stereo": 1}
+    empty_checks = {check.name: sum(check.why.values()) for check in report.checks if not check.count}
+    assert empty_checks == {"checksum": 1, "force": 1, "compliance": 1, "contact": 1, "stereo": 1}
     assert report.good
-    assert f" {len(report.checks) - len(empty)} checks" in report.lines()[-1]
-    assert all(name in report.as_dict()["verdict"] for name in empty)
+    assert f" {len(report.checks) - len(empty_checks)} checks" in report.lines()[-1]
+    assert all(name in report.as_dict()["verdict"] for name in empty_checks)
 
 
 def test_a_dataset_without_a_finished_sequence_is_not_good(tmp_path: Path) -> None:
     with claim(tmp_path / "out", JOB.model_copy(update={"sequences": 1})) as folder:
         folder.mark_failed({"index": 0, "reason": "refused"})
         index.write_index(folder)
-    assert failing(tmp_path / "out") == {"dataset"}
+    assert list_faults(tmp_path / "out") == {"dataset"}
 
 
-def no_number(root: Path) -> None:
+def put_nan(root: Path) -> None:
     zarr.open_group(str(root / "000001.zarr"), mode="r+")["force"][2, 1] = np.nan
 
 
-def leaking_split(root: Path) -> None:
+def leak_split(root: Path) -> None:
     rows = index.read_index(root).to_pylist()
     for row, side in zip(rows, ("train", "test"), strict=True):
         row.update(anatomy="mesh-1", split=side)
     index.save_rows(root, rows)
 
 
-def edited_axes(root: Path) -> None:
+def edit_axes(root: Path) -> None:
     path = root / "000000.zarr/flow/zarr.json"
     path.write_text(path.read_text().replace('"row"', '"column "'))
 
 
-def unnamed_version(root: Path) -> None:
-    described = json.loads((root / "dataset.json").read_text())
-    described["generators"][0]["content"] = "another"
-    (root / "dataset.json").write_text(json.dumps(described))
+def edit_generator(root: Path) -> None:
+    manifest = json.loads((root / "dataset.json").read_text())
+    manifest["generators"][0]["content"] = "another"
+    (root / "dataset.json").write_text(json.dumps(manifest))
 
 
-def swapped_sequences(root: Path) -> None:
+def swap_sequences(root: Path) -> None:
     (root / "000000.zarr").rename(root / "x")
     (root / "000001.zarr").rename(root / "000000.zarr")
     (root / "x").rename(root / "000001.zarr")
 
 
-def replaced_value(root: Path) -> None:
+def replace_value(root: Path) -> None:
     """Changes a value through Zarr, which updates the chunk's checksum."""
     array = zarr.open_group(str(root / "000001.zarr"), mode="r+")["depth"]
     array[3, 5, 5] = np.float32(array[3, 5, 5]) + np.float32(1e-3)
 
 
-def broken_chunk(root: Path) -> None:
+def truncate_chunk(root: Path) -> None:
     shard = next(path for path in (root / "000001.zarr/rgb/c").rglob("*") if path.is_file())
     shard.write_bytes(shard.read_bytes()[:-10])
 
 
 @pytest.mark.parametrize(
-    ("damage", "found"),
+    ("damage", "failures"),
     [
-        (no_number, {"finite", "checksum", "rest"}),
-        (leaking_split, {"splits", "dataset"}),
-        (edited_axes, {"schema"}),
-        (unnamed_version, {"dataset"}),
+        (put_nan, {"finite", "checksum", "rest"}),
+        (leak_split, {"splits", "dataset"}),
+        (edit_axes, {"schema"}),
+        (edit_generator, {"dataset"}),
         (
             lambda root: foreign_video.edit_attributes(root / "000000.zarr", False, young_kpa=2),
             {"seal", "dataset"},
         ),
-        (swapped_sequences, {"seal", "dataset"}),
-        (replaced_value, {"checksum"}),
-        (broken_chunk, {"readable"}),
+        (swap_sequences, {"seal", "dataset"}),
+        (replace_value, {"checksum"}),
+        (truncate_chunk, {"readable"}),
         (lambda root: shutil.rmtree(root / "000001.zarr"), {"dataset"}),
         (lambda root: (root / "index.parquet").write_bytes(b"PAR1"), {"dataset"}),
     ],
 )
-def test_damage_is_found(dataset: Path, damage: Callable[[Path], object], found: set[str]) -> None:
+def test_damage_is_found(dataset: Path, damage: Callable[[Path], object], failures: set[str]) -> None:
     damage(dataset)
-    assert failing(dataset) == found
+    assert list_faults(dataset) == failures
 
 
 @pytest.mark.parametrize(
@@ -164,7 +166,7 @@ def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: di
     foreign_video.edit_attributes(dataset / "000000.zarr", **changes)
     with pytest.raises(UserError):
         open_sequence(dataset / "000000.zarr")
-    assert "readable" in failing(dataset)
+    assert "readable" in list_faults(dataset)
 
 
 def test_an_edited_sequence_is_not_exported(dataset: Path) -> None:
@@ -178,17 +180,17 @@ def test_an_index_of_another_program_and_a_damaged_split_are_refused(dataset: Pa
     pq.write_table(pa.table({"a": [1]}), dataset / "index.parquet")
     with pytest.raises(UserError):
         index.read_index(dataset)
-    assert "dataset" in failing(dataset)
+    assert "dataset" in list_faults(dataset)
     (dataset / "split.json").write_text(text)
     with pytest.raises(UserError, match="split"):
         sequence_split.read_stored(dataset)
 
 
 def test_no_run_follows_a_link(dataset: Path, tmp_path: Path) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    (elsewhere / "precious").mkdir(parents=True)
+    link_target = tmp_path / "elsewhere"
+    (link_target / "precious").mkdir(parents=True)
     shutil.rmtree(dataset / ".run/scratch")
-    (dataset / ".run/scratch").symlink_to(elsewhere)
+    (dataset / ".run/scratch").symlink_to(link_target)
     with pytest.raises(UserError), claim(dataset, JOB):
         pass
-    assert (elsewhere / "precious").is_dir()
+    assert (link_target / "precious").is_dir()

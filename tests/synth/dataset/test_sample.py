@@ -14,14 +14,14 @@ def test_the_sample_is_small_sound_and_unpacked_once(tmp_path: Path, monkeypatch
     assert sample._ARCHIVE.stat().st_size < 2e6
     monkeypatch.setenv("SULCUS_CACHE", str(tmp_path))
     sample.cache.folder.cache_clear()
-    first, again = synth.sample(), synth.sample()
+    dataset, second_dataset = synth.sample(), synth.sample()
     sample.cache.folder.cache_clear()
-    assert first.root == again.root
-    assert first.root.is_relative_to(tmp_path)
-    assert len(first) == 2
-    moved = np.linalg.norm(first[0]["flow"][:], axis=-1)
-    assert moved[0].max() == 0 < 1 < moved.max()
-    report = verify_dataset(first.root)
+    assert dataset.root == second_dataset.root
+    assert dataset.root.is_relative_to(tmp_path)
+    assert len(dataset) == 2
+    motion_px = np.linalg.norm(dataset[0]["flow"][:], axis=-1)
+    assert motion_px[0].max() == 0 < 1 < motion_px.max()
+    report = verify_dataset(dataset.root)
     assert report.good, [check.failures for check in report.checks]
 
 

@@ -33,23 +33,23 @@ def root(tmp_path: Path) -> Path:
 
 def test_values_come_back_as_they_were_put(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)  # several shards, the last one not full
-    found = make(JOB, 2, root)
+    stored_sequence = make(JOB, 2, root)
     rng = np.random.default_rng((5, 2))
-    assert np.array_equal(found["force"][:], rng.normal(size=(7, 3)))
-    assert np.array_equal(found["tissue"][:], rng.random((30, 40)) > 0.2)
-    assert np.array_equal(found["area"][:], rng.random((30, 40)).astype(np.float32))
+    assert np.array_equal(stored_sequence["force"][:], rng.normal(size=(7, 3)))
+    assert np.array_equal(stored_sequence["tissue"][:], rng.random((30, 40)) > 0.2)
+    assert np.array_equal(stored_sequence["area"][:], rng.random((30, 40)).astype(np.float32))
     for t in range(7):
-        assert np.array_equal(found["rgb"][t], rng.integers(0, 256, (30, 40, 3)).astype(np.uint8))
+        assert np.array_equal(stored_sequence["rgb"][t], rng.integers(0, 256, (30, 40, 3)).astype(np.uint8))
         for name in ("visible", "tool", "glare"):
-            assert np.array_equal(found[name][t], rng.random((30, 40)) > 0.5)
-        assert np.array_equal(found["flow"][t], rng.normal(size=(30, 40, 2)).astype(np.float32))
+            assert np.array_equal(stored_sequence[name][t], rng.random((30, 40)) > 0.5)
+        assert np.array_equal(stored_sequence["flow"][t], rng.normal(size=(30, 40, 2)).astype(np.float32))
         rng.random((30, 40))
         rng.normal(size=(30, 40, 3))
-    assert found["flow"].shape == (7, 30, 40, 2)
-    assert (found.index, found.frames, found.size) == (2, 7, (30, 40))
-    for name in found.fields:
-        assert found[name].dtype == np.dtype(FIELDS[name].dtype)
-        assert found[name].shape == FIELDS[name].shape(7, (30, 40))
+    assert stored_sequence["flow"].shape == (7, 30, 40, 2)
+    assert (stored_sequence.index, stored_sequence.frames, stored_sequence.size) == (2, 7, (30, 40))
+    for name in stored_sequence.fields:
+        assert stored_sequence[name].dtype == np.dtype(FIELDS[name].dtype)
+        assert stored_sequence[name].shape == FIELDS[name].shape(7, (30, 40))
 
 
 def test_the_content_hash_depends_on_all_attributes_but_timings_and_versions(root: Path) -> None:
@@ -61,37 +61,41 @@ def test_the_content_hash_depends_on_all_attributes_but_timings_and_versions(roo
 
 def test_single_frames_equal_those_read_by_zarr(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)
-    found, plain = make(JOB, 2, root), zarr.open_group(str(root / "000002.zarr"), mode="r")
-    for name in found.fields:
-        column, array = found[name], plain[name]
-        fast = fast_read.open_frames(array, root / "000002.zarr" / name)
-        assert (fast is not None) == FIELDS[name].framed
+    stored_sequence, group = make(JOB, 2, root), zarr.open_group(str(root / "000002.zarr"), mode="r")
+    for name in stored_sequence.fields:
+        column, array = stored_sequence[name], group[name]
+        fast_frames = fast_read.open_frames(array, root / "000002.zarr" / name)
+        assert (fast_frames is not None) == FIELDS[name].framed
         for t in (0, 6, 2, -1, -7):
             assert np.array_equal(column[t], array[t])
-            assert fast is None or np.array_equal(fast[t], array[t])
+            assert fast_frames is None or np.array_equal(fast_frames[t], array[t])
     for t in (7, -8):
         with pytest.raises(IndexError):
-            found["flow"][t]
-    column = found["flow"]
+            stored_sequence["flow"][t]
+    column = stored_sequence["flow"]
     column[0]
     (root / "000002.zarr/flow/c/0/0/0/0").write_bytes(b"short")
     with pytest.raises(UserError, match="flow"):
         column[1]
 
 
-def writer(folder: Path) -> Writer:
+def make_writer(folder: Path) -> Writer:
     return Writer(folder, 9, frames=2, size=(4, 5), job=JOB)
 
 
 def test_nan_and_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
-    sink = writer(tmp_path)
+    sink = make_writer(tmp_path)
     sink.put_frame("depth", 0, np.ones((4, 5)))
     with pytest.raises(NotFinite, match="depth, frame 1"):
         sink.put_frame("depth", 1, np.where(np.arange(20).reshape(4, 5) == 13, np.nan, 1.0))
-    sink = writer(tmp_path)
-    wrong = ("depth", 0, (5, 4), "shape"), ("rgb", 0, (4, 5, 3), "float64"), ("depth", 1, (4, 5), "1 after 0")
-    for name, frame, shape, named in wrong:
-        with pytest.raises(ValueError, match=named):
+    sink = make_writer(tmp_path)
+    wrong_calls = (
+        ("depth", 0, (5, 4), "shape"),
+        ("rgb", 0, (4, 5, 3), "float64"),
+        ("depth", 1, (4, 5), "1 after 0"),
+    )
+    for name, frame, shape, message in wrong_calls:
+        with pytest.raises(ValueError, match=message):
             sink.put_frame(name, frame, np.ones(shape))
     with pytest.raises(ValueError, match="colour"):
         sink.put("colour", np.ones(3))
@@ -100,16 +104,18 @@ def test_nan_and_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> 
 def test_float16_is_read_as_float32_within_the_stated_error(root: Path, tmp_path: Path) -> None:
     job = JOB.model_copy(update={"store": JOB.store.model_copy(update={"flow": "float16"})})
     (tmp_path / "half").mkdir()
-    exact, half = open_sequence(root / "000000.zarr"), make(job, 0, tmp_path / "half")
-    assert (half["flow"].dtype, half["flow"].stored) == ("float32", "float16")
-    assert half["depth"].stored == "float32"
-    assert half["flow"][2].dtype == np.float32
-    worst = float(np.abs(half["flow"][:] - exact["flow"][:]).max())
-    stated = half.attrs["summary"]["rounding_px"]["flow"]
-    assert 0 < worst <= stated * (1 + 1e-3)
-    assert stated < 0.004, "motion here is below 16 px"
-    assert "rounding_px" not in exact.attrs["summary"]
-    assert all(measure.good for _, measure in contents.check_values(half, [0], False, Stopwatch()))
+    float32_sequence, float16_sequence = open_sequence(root / "000000.zarr"), make(job, 0, tmp_path / "half")
+    assert (float16_sequence["flow"].dtype, float16_sequence["flow"].stored) == ("float32", "float16")
+    assert float16_sequence["depth"].stored == "float32"
+    assert float16_sequence["flow"][2].dtype == np.float32
+    worst_px = float(np.abs(float16_sequence["flow"][:] - float32_sequence["flow"][:]).max())
+    stated_px = float16_sequence.attrs["summary"]["rounding_px"]["flow"]
+    assert 0 < worst_px <= stated_px * (1 + 1e-3)
+    assert stated_px < 0.004, "motion here is below 16 px"
+    assert "rounding_px" not in float32_sequence.attrs["summary"]
+    assert all(
+        measure.good for _, measure in contents.check_values(float16_sequence, [0], False, Stopwatch())
+    )
 
 
 def test_a_job_sets_which_fields_are_stored(tmp_path: Path) -> None:
@@ -122,7 +128,7 @@ def test_a_job_sets_which_fields_are_stored(tmp_path: Path) -> None:
 
 
 def test_nothing_is_visible_before_the_seal(tmp_path: Path) -> None:
-    sink = writer(tmp_path)
+    sink = make_writer(tmp_path)
     sink.put("time", np.arange(2.0))
     assert [path.name for path in tmp_path.iterdir()] == ["000009.zarr.part"]
     with pytest.raises(UserError):

@@ -28,8 +28,8 @@ for loop, types in jit.LOOPS:
 
 def test_a_dataset_calls_loops_with_the_types_they_are_compiled_for(tmp_path: Path) -> None:
     call = [sys.executable, "-c", _RENDER, str(tmp_path)]
-    wrong = subprocess.run(call, capture_output=True, text=True, check=True).stdout
-    assert not wrong, wrong
+    mismatches = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert not mismatches, mismatches
 
 
 def test_processes_compile_once_for_a_version_and_a_target(

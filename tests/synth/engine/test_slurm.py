@@ -15,7 +15,7 @@ pytestmark = pytest.mark.trial
 
 SMALL = {"render": {"size": [64, 48], "spp": 2}, "anatomy": {"vertices": 2500}, "fem": {"tets": 300}}
 JOB = Job.model_validate({"seed": 7, "sequences": 5, "frames": 3, "flow": {"backend": "ideal"}, **SMALL})
-DESCRIBED = """
+CLUSTER_YAML = """
 jobs: 2
 cores: 1
 processes: 1
@@ -27,7 +27,7 @@ log_directory: LOGS
 """
 
 
-class Disturbing(Silent):
+class Disturber(Silent):
     """When the first sequence has ended, drains the node and kills one of the two jobs."""
 
     def __init__(self, node: str) -> None:
@@ -38,9 +38,9 @@ class Disturbing(Silent):
         super().end(attempt, again)  # type: ignore[arg-type]
         if self._once.acquire(blocking=False):
             slurm_cluster.call("scontrol", "update", f"nodename={self.node}", "state=drain", "reason=test")
-            running = slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i").split()
-            assert len(running) == 2, "both slots should be busy"
-            self.killed = running[0]
+            job_ids = slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i").split()
+            assert len(job_ids) == 2, "both slots should be busy"
+            self.killed = job_ids[0]
             slurm_cluster.call("scancel", "--signal=KILL", "--full", self.killed)
             slurm_cluster.call("scancel", self.killed)
 
@@ -48,16 +48,18 @@ class Disturbing(Silent):
 @pytest.mark.skipif(bool(slurm_cluster.missing()), reason=slurm_cluster.missing())
 def test_a_killed_job_and_a_drained_node_change_no_byte(tmp_path: Path) -> None:
     pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
-    described = tmp_path / "slurm.yaml"
-    described.write_text(DESCRIBED.replace("LOGS", str(tmp_path / "logs")))
+    cluster_file = tmp_path / "slurm.yaml"
+    cluster_file.write_text(CLUSTER_YAML.replace("LOGS", str(tmp_path / "logs")))
     with slurm_cluster.slurm_cluster(tmp_path / "slurm") as node:
-        watcher = Disturbing(node)
-        made = run.run_job(JOB, tmp_path / "cluster", run.Options(engine=str(described)), watcher)
+        watcher = Disturber(node)
+        cluster_summary = run.run_job(
+            JOB, tmp_path / "cluster", run.Options(engine=str(cluster_file)), watcher
+        )
         assert watcher.killed
         wait_for(lambda: not slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i"))
         assert "drain" in slurm_cluster.call("sinfo", "-h", "-o", "%T")
-    assert (made.done, made.failed) == (JOB.sequences, {})
-    here = run.run_job(JOB, tmp_path / "local", run.Options(workers=1), Silent())
-    assert made.content_hash == here.content_hash
+    assert (cluster_summary.done, cluster_summary.failed) == (JOB.sequences, {})
+    local_summary = run.run_job(JOB, tmp_path / "local", run.Options(workers=1), Silent())
+    assert cluster_summary.content_hash == local_summary.content_hash
     assert not list((tmp_path / "cluster").glob("*.part"))
     assert not list((Folder(tmp_path / "cluster").state / "failed").glob("*"))

@@ -25,26 +25,26 @@ RELAXING = ((0.45, 0.5), (0.3, 5.0))
 
 
 def run(
-    driven: Gesture,
+    tool_gesture: Gesture,
     tissue: Tissue = TISSUE,
     frames: int = 11,
     relaxation: tuple[tuple[float, float], ...] = (),
 ) -> Deformation:
-    tets = tetrahedra.block(500, list(driven.focus))
-    return deform(TimeScheme(relaxation=relaxation), tissue, [driven], tets, patch(), frames, 5.0)
+    tets = tetrahedra.block(500, list(tool_gesture.focus))
+    return deform(TimeScheme(relaxation=relaxation), tissue, [tool_gesture], tets, patch(), frames, 5.0)
 
 
-def marked(number: int, scene: dict) -> object:  # type: ignore[type-arg]
+def mark_scene(number: int, scene: dict) -> object:  # type: ignore[type-arg]
     """A scene: slow where its contact is so wide that it needs a finer mesh, and half of those a trial."""
     marks = [] if scene["radius"] < 6 else [pytest.mark.slow if number % 2 else pytest.mark.trial]
     return pytest.param(scene, marks=marks, id=f"{scene['radius']:g} {scene['alpha']:g} {scene['way']}")
 
 
-@pytest.mark.parametrize("scene", list(starmap(marked, enumerate(FELUPE["scenes"]))))
+@pytest.mark.parametrize("scene", list(starmap(mark_scene, enumerate(FELUPE["scenes"]))))
 def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[type-arg]
-    found = compare_driven(scene, 2400 if scene["radius"] < 6 else 3200)
-    assert found["force_error"] <= 0.02
-    assert found["motion_error"] <= 0.03
+    comparison = compare_driven(scene, 2400 if scene["radius"] < 6 else 3200)
+    assert comparison["force_error"] <= 0.02
+    assert comparison["motion_error"] <= 0.03
 
 
 BALLS = [
@@ -57,27 +57,27 @@ BALLS = [
 
 @pytest.mark.parametrize("scene", BALLS)
 def test_a_disc_that_sticks_moves_tissue_as_a_ball_does_that_only_presses(scene: dict) -> None:  # type: ignore[type-arg]
-    found = compare_ball(scene)
-    assert 0.9 < found["force"] < 1.13
-    assert found["motion_error"] < 0.07
+    comparison = compare_ball(scene)
+    assert 0.9 < comparison["force"] < 1.13
+    assert comparison["motion_error"] < 0.07
 
 
 def test_a_small_press_is_that_of_a_ball() -> None:
     """F = 4/3 E* sqrt(R d^3) where a = sqrt(R d) touches (Johnson 1985, 4.2); a disc is as stiff at 0.9 a."""
-    ball, depth = 6.0, 0.1
-    way, middle = np.array([0.0, 0.0, -depth]), np.zeros((1, 3))
-    force, _ = drive(0.9 * np.sqrt(ball * depth), way, 0.45, -8.0, middle)
-    hertz = 4 / 3 / (1 - 0.45**2) * np.sqrt(ball * depth**3)
+    radius, depth = 6.0, 0.1
+    displacement, middle = np.array([0.0, 0.0, -depth]), np.zeros((1, 3))
+    force, _ = drive(0.9 * np.sqrt(radius * depth), displacement, 0.45, -8.0, middle)
+    hertz = 4 / 3 / (1 - 0.45**2) * np.sqrt(radius * depth**3)
     assert -force[2] == pytest.approx(hertz, rel=0.07)
 
 
-@pytest.mark.parametrize(("kind", "way"), [("push", DOWN), ("retract", ASIDE), ("grasp", UP)])
+@pytest.mark.parametrize(("kind", "direction"), [("push", DOWN), ("retract", ASIDE), ("grasp", UP)])
 def test_the_load_is_the_reaction_where_the_instrument_holds(
-    kind: str, way: tuple[float, float, float]
+    kind: str, direction: tuple[float, float, float]
 ) -> None:
-    motion, surface = run(gesture(kind, way)), patch()
+    motion, surface = run(gesture(kind, direction)), patch()
     area = surface_embedding.vertex_area(*surface)
-    force = motion.force @ np.array(way)
+    force = motion.force @ np.array(direction)
     assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * force.max()
     assert not motion.displacement[0].any()
     assert not motion.force[[0, -1]].any()
@@ -88,14 +88,14 @@ def test_the_load_is_the_reaction_where_the_instrument_holds(
     # The instrument's work is the energy that tissue and layer store: by the trapezoidal rule.
     if kind != "grasp":
         assert motion.energy is not None
-        load = trajectory(gesture(kind, way), 11).load[:6]
+        load = trajectory(gesture(kind, direction), 11).load[:6]
         work = np.sum(0.5 * (force[1:6] + force[:5]) * np.diff(2.0 * load))
-        lag = 2.0 * np.array(way) - motion.displacement[5]
+        lag = 2.0 * np.array(direction) - motion.displacement[5]
         layer = 0.5 * np.einsum("v,vd,vd->", area, motion.traction[5], lag)
         assert motion.energy[5] + layer == pytest.approx(work, rel=0.03)
     inner = np.hypot(*surface.vertices[:, :2].T) < (1.0 if kind == "grasp" else 2.0)
-    along = motion.displacement[5][inner] @ np.array(way)
-    assert along.mean() == pytest.approx(2.0, rel=0.06 if kind != "grasp" else 0.2)  # tissue follows
+    travel = motion.displacement[5][inner] @ np.array(direction)
+    assert travel.mean() == pytest.approx(2.0, rel=0.06 if kind != "grasp" else 0.2)  # tissue follows
 
 
 def test_a_small_press_is_that_of_a_flat_punch() -> None:
@@ -109,25 +109,26 @@ def test_a_small_press_is_that_of_a_flat_punch() -> None:
 @pytest.mark.parametrize("relaxation", [(), RELAXING])
 def test_a_wanted_force_is_reached(relaxation: tuple[tuple[float, float], ...]) -> None:
     motion = run(gesture(travel=None, force=60.0), relaxation=relaxation)
-    close = 0.05 if relaxation else 0.01  # the layer doesn't relax, which the search for the way leaves out
-    assert np.linalg.norm(motion.force, axis=1).max() == pytest.approx(60.0, rel=close)
+    # The layer doesn't relax, which the search for the way leaves out.
+    tolerance = 0.05 if relaxation else 0.01
+    assert np.linalg.norm(motion.force, axis=1).max() == pytest.approx(60.0, rel=tolerance)
 
 
 def test_held_tissue_relaxes_and_lets_go_before_the_instrument_is_back() -> None:
     elastic, relaxing = (run(gesture(), frames=21, relaxation=terms) for terms in ((), RELAXING))
-    firm, soft = (-motion.force[:, 2] for motion in (elastic, relaxing))
-    assert soft.max() < 0.9 * firm.max()
+    elastic_mn, relaxing_mn = (-motion.force[:, 2] for motion in (elastic, relaxing))
+    assert relaxing_mn.max() < 0.9 * elastic_mn.max()
     hold = slice(9, 12)
-    assert np.ptp(firm[hold]) < 0.02 * firm.max()
-    assert np.all(np.diff(soft[hold]) < 0)
-    assert soft.min() >= 0  # it doesn't pull
-    assert np.count_nonzero(soft) < np.count_nonzero(firm)
+    assert np.ptp(elastic_mn[hold]) < 0.02 * elastic_mn.max()
+    assert np.all(np.diff(relaxing_mn[hold]) < 0)
+    assert relaxing_mn.min() >= 0  # it doesn't pull
+    assert np.count_nonzero(relaxing_mn) < np.count_nonzero(elastic_mn)
     assert np.abs(relaxing.displacement[-1]).max() > 0.05  # and the tissue creeps back
     # By the Prony series of the elastic force, but for skull and layer, which don't relax.
     clock = Clock(0.2, relaxation=RELAXING)
-    still = soft > 0
-    expected = driven_contact.relaxed(elastic.force, clock)[:, 2]
-    assert np.abs(-expected - soft)[still].max() <= 0.1 * soft.max()
+    contact = relaxing_mn > 0
+    expected = driven_contact.relax(elastic.force, clock)[:, 2]
+    assert np.abs(-expected - relaxing_mn)[contact].max() <= 0.1 * relaxing_mn.max()
 
 
 def test_a_stiff_pia_carries_a_part_of_the_load() -> None:
@@ -138,30 +139,33 @@ def test_a_stiff_pia_carries_a_part_of_the_load() -> None:
 
 
 def test_two_instruments_and_a_pulse_act_at_once() -> None:
-    def moved(kind: str, x: float, way: tuple[float, float, float]) -> Gesture:
-        one = gesture(kind, way, 1.5, size=(5.0, 5.0))
-        return replace(one, contacts=(ToolContact((x, 0.0), (0.0, 0.0, 0.0)),), point_mm=(x, 0.0))
+    def place_gesture(kind: str, x: float, direction: tuple[float, float, float]) -> Gesture:
+        template = gesture(kind, direction, 1.5, size=(5.0, 5.0))
+        return replace(template, contacts=(ToolContact((x, 0.0), (0.0, 0.0, 0.0)),), point_mm=(x, 0.0))
 
-    both = [moved("push", -5.0, DOWN), replace(moved("pull", 5.0, UP), timing=(0.2, 0.5, 0.7, 0.95))]
-    tets = tetrahedra.block(600, [place for one in both for place in one.focus])
+    gestures = [
+        place_gesture("push", -5.0, DOWN),
+        replace(place_gesture("pull", 5.0, UP), timing=(0.2, 0.5, 0.7, 0.95)),
+    ]
+    tets = tetrahedra.block(600, [place for tool in gestures for place in tool.focus])
     scheme, pulse = TimeScheme(relaxation=RELAXING), Pulse(0.3, 1.2, 0.5, 0.0, 0.3, 0.0)
-    motion = deform(scheme, TISSUE, both, tets, patch(), 11, 5.0, pulse)
+    motion = deform(scheme, TISSUE, gestures, tets, patch(), 11, 5.0, pulse)
     area = surface_embedding.vertex_area(*patch())
     assert motion.by_instrument.shape == (11, 2, 3)
-    most = np.abs(motion.force).max()
-    assert np.abs(motion.by_instrument.sum(axis=1) - motion.force).max() <= 1e-9 * most
-    assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * most
+    peak = np.abs(motion.force).max()
+    assert np.abs(motion.by_instrument.sum(axis=1) - motion.force).max() <= 1e-9 * peak
+    assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * peak
     assert motion.by_instrument[5, 0, 2] < 0 < motion.by_instrument[6, 1, 2]
     assert np.abs(motion.displacement[1]).max() > 0.02  # the pulse alone
     assert not motion.by_instrument[1].any()
 
 
 def test_a_way_that_yields_ends_where_tissue_bears_no_more() -> None:
-    far = gesture(travel=7.0, size=(5.0, 5.0))
-    assert far.drive is not None
-    motion = run(replace(far, drive=replace(far.drive, yields=True)))
-    deepest = -motion.displacement[5, :, 2].min()
-    assert 2.1 < deepest < 6.5
+    press = gesture(travel=7.0, size=(5.0, 5.0))
+    assert press.drive is not None
+    motion = run(replace(press, drive=replace(press.drive, yields=True)))
+    depth = -motion.displacement[5, :, 2].min()
+    assert 2.1 < depth < 6.5
     assert motion.min_jacobian is not None
     assert motion.min_jacobian.min() > 0.14
 

@@ -24,13 +24,13 @@ PUSH |= {"footprint_mm": 3.5, "timing": [0.1, 0.3, 0.6, 0.9]}
 PULL = {"gesture": "pull", "place": [-5.0, 1.0], "force_mn": 1.5, "direction": [0, 0, 2]}
 
 
-def job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
+def make_job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
     return synth.Job.model_validate({"seed": 3, "sequences": 20, "fem": {"instrument_list": crew, **fem}})
 
 
 def test_given_values_are_used_and_the_others_drawn() -> None:
-    given = job(PUSH, PULL)
-    cases = [draw_scenario(given, index) for index in range(20)]
+    job = make_job(PUSH, PULL)
+    cases = [draw_scenario(job, index) for index in range(20)]
     for case in cases:
         push, pull = case.gestures
         assert (push.kind, push.point_mm, push.load, push.footprint_mm) == ("push", (4.0, 0.0), 0.1, 3.5)
@@ -41,17 +41,21 @@ def test_given_values_are_used_and_the_others_drawn() -> None:
         assert pull.force_mn == pytest.approx(1.5)
         assert 3 <= pull.footprint_mm <= 6
         assert tool_gesture.clearance(push, pull) >= 0
-    for drawn in ("azimuth_deg", "hover_mm"):
-        assert len({getattr(case.gestures[0], drawn) for case in cases}) == 20
+    for attribute in ("azimuth_deg", "hover_mm"):
+        assert len({getattr(case.gestures[0], attribute) for case in cases}) == 20
     assert len({case.gestures[1].timing for case in cases}) == 20
 
 
 def test_contradictions_are_refused() -> None:
-    timed = ([0.2, "0.6 s", "1 s", "1.6 s"], [0.2, 0.6, 1.2, 1.6])
-    wrong = {"place": [11, 0]}, {"gesture": "slide", "direction": [0, 0, -1]}, {"load": 0.1, "force_mn": 1}
-    for one in (*wrong, *({"timing": given} for given in timed)):
+    timings = ([0.2, "0.6 s", "1 s", "1.6 s"], [0.2, 0.6, 1.2, 1.6])
+    contradictions = (
+        {"place": [11, 0]},
+        {"gesture": "slide", "direction": [0, 0, -1]},
+        {"load": 0.1, "force_mn": 1},
+    )
+    for instrument in (*contradictions, *({"timing": timing} for timing in timings)):
         with pytest.raises(ValidationError, match="instrument_list"):
-            job(one)
+            make_job(instrument)
 
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
@@ -63,26 +67,28 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     motion = solver.deform(read_scheme(fem), tissue, gestures, tets, surface, frames, 25.0)
     area = vertex_area(*surface)
     np.testing.assert_allclose(motion.by_instrument.sum(axis=1), motion.force, atol=1e-12)
-    moved = surface.vertices + motion.displacement
+    vertices = surface.vertices + motion.displacement
     for k, gesture in enumerate(gestures):
-        away, reach = [], []
-        for one in (gesture, gestures[1 - k]):
-            away.append(np.linalg.norm(surface.vertices[:, :2] - one.contacts[0].point_mm, axis=1))
-            reach.append(np.linalg.norm(one.axes, axis=1).max())
-        mine, theirs = away[0] < 1.1 * reach[0], away[1] < reach[1]
-        if not (mine & theirs).any():
-            part = np.einsum("v,tvd->td", area[mine], motion.traction[:, mine])
+        distances, radii = [], []
+        for tool in (gesture, gestures[1 - k]):
+            distances.append(np.linalg.norm(surface.vertices[:, :2] - tool.contacts[0].point_mm, axis=1))
+            radii.append(np.linalg.norm(tool.axes, axis=1).max())
+        own_vertices, other_vertices = distances[0] < 1.1 * radii[0], distances[1] < radii[1]
+        if not (own_vertices & other_vertices).any():
+            part = np.einsum("v,tvd->td", area[own_vertices], motion.traction[:, own_vertices])
             np.testing.assert_allclose(part, motion.by_instrument[:, k], atol=1e-9)
-        pressed = np.linalg.norm(motion.by_instrument[:, k], axis=1)
-        apart = np.linalg.norm(motion.tip[:, 2 * k : 2 * k + 2, None] - moved[:, None], axis=3).min(axis=2)
-        assert apart[pressed > 0.05 * pressed.max()].max() < 0.6  # half a vertex spacing
-        assert apart[0].min() > 3
+        force = np.linalg.norm(motion.by_instrument[:, k], axis=1)
+        distance = np.linalg.norm(motion.tip[:, 2 * k : 2 * k + 2, None] - vertices[:, None], axis=3).min(
+            axis=2
+        )
+        assert distance[force > 0.05 * force.max()].max() < 0.6  # half a vertex spacing
+        assert distance[0].min() > 3
     if law == "linear":
-        alone = [
+        displacements = [
             solver.deform(read_scheme(fem), tissue, [g], tets, surface, frames, 25.0).displacement
             for g in gestures
         ]
-        np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
+        np.testing.assert_allclose(motion.displacement, sum(displacements), atol=1e-8)
 
 
 def test_a_force_replaces_the_load() -> None:
@@ -100,59 +106,66 @@ def test_a_force_replaces_the_load() -> None:
 def test_the_page_has_the_table_of_instruments() -> None:
     page = (Path(__file__).parents[3] / "docs/howto/instruments.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
-    shown = {
+    page_tools = {
         gesture: [*re.findall(r"`(\w+)` \d+%", usual), *re.findall(r"`(\w+)`", others)]
         for gesture, usual, others in rows
     }
-    assert shown == {kind: list(takes) for kind, takes in mechanics_sections.INSTRUMENTS.items()}
+    assert page_tools == {
+        kind: list(tool_shares) for kind, tool_shares in mechanics_sections.INSTRUMENTS.items()
+    }
     shares = [int(share) for _, usual, _ in rows for share in re.findall(r"(\d+)%", usual)]
-    known = [share for takes in mechanics_sections.INSTRUMENTS.values() for share in takes.values() if share]
-    assert shares == [round(100 * share) for share in known]
+    known_shares = [
+        share
+        for tool_shares in mechanics_sections.INSTRUMENTS.values()
+        for share in tool_shares.values()
+        if share
+    ]
+    assert shares == [round(100 * share) for share in known_shares]
 
 
 def test_gestures_and_instruments_are_drawn_together() -> None:
-    for kind, takes in mechanics_sections.INSTRUMENTS.items():
+    for kind, tool_shares in mechanics_sections.INSTRUMENTS.items():
         for tool in get_args(mechanics_sections.Instrument):
-            one = {"gesture": kind, "instrument": tool}
-            if tool in takes or tool == "none":
-                (gesture,) = draw_scenario(job(one), 0).gestures
+            instrument = {"gesture": kind, "instrument": tool}
+            if tool in tool_shares or tool == "none":
+                (gesture,) = draw_scenario(make_job(instrument), 0).gestures
                 assert (gesture.kind, gesture.instrument) == (kind, tool)
             else:
-                with pytest.raises(ValidationError, match=f"a {kind} takes {' or '.join(takes)}"):
-                    job(one)
-    blades = job(instrument="spatula")
-    assert blades.fem.gestures == ("push", "slide", "retract")
-    drawn = [draw_scenario(blades, k).gestures[0] for k in range(20)]
-    assert {one.kind for one in drawn} == {"push", "slide", "retract"}
-    assert {one.instrument for one in drawn} == {"spatula"}
+                with pytest.raises(ValidationError, match=f"a {kind} takes {' or '.join(tool_shares)}"):
+                    make_job(instrument)
+    spatula_job = make_job(instrument="spatula")
+    assert spatula_job.fem.gestures == ("push", "slide", "retract")
+    gestures = [draw_scenario(spatula_job, k).gestures[0] for k in range(20)]
+    assert {gesture.kind for gesture in gestures} == {"push", "slide", "retract"}
+    assert {gesture.instrument for gesture in gestures} == {"spatula"}
     with pytest.raises(ValidationError, match="a pull takes forceps"):
-        job(instrument="spatula", gestures=["pull", "push"])
+        make_job(instrument="spatula", gestures=["pull", "push"])
 
 
 @pytest.mark.parametrize("tool", ["forceps", "spatula", "suction", "probe"])
 def test_footprints_hold_their_force_and_have_their_form(tool: str) -> None:
     kind = "pull" if tool == "forceps" else "push"
-    drawn = draw_scenario(job({"gesture": kind, "instrument": tool, "place": [0, 0]}), 0).gestures[0]
+    gesture = draw_scenario(make_job({"gesture": kind, "instrument": tool, "place": [0, 0]}), 0).gestures[0]
     surface = patch(241)
     area = vertex_area(*surface)
     flat = np.column_stack([surface.vertices[:, :2], 0 * area])
-    pressure = tool_gesture.footprint(np.zeros(2), drawn.axes, flat, area, tool == "suction")
+    pressure = tool_gesture.footprint(np.zeros(2), gesture.axes, flat, area, tool == "suction")
     assert pressure @ area == pytest.approx(1.0, abs=1e-12)
     # The same P has the same largest pressure, whatever the form.
-    assert pressure.max() == pytest.approx(3 / np.pi / drawn.footprint_mm**2, rel=0.02)
+    assert pressure.max() == pytest.approx(3 / np.pi / gesture.footprint_mm**2, rel=0.02)
     spread = np.linalg.eigh(np.einsum("v,vi,vj->ij", pressure * area, flat[:, :2], flat[:, :2]))
     ratio = np.sqrt(spread.eigenvalues[1] / spread.eigenvalues[0])
     assert ratio == pytest.approx({"forceps": 2.0, "spatula": 2.0}.get(tool, 1.0), rel=0.02)
-    along = abs(spread.eigenvectors[:, 1] @ drawn.shaft[:2]) / np.linalg.norm(drawn.shaft[:2])
-    assert {"forceps": along > 0.99, "spatula": along < 0.1}.get(tool, True)
-    middle = pressure[np.linalg.norm(flat, axis=1) < 0.1 * drawn.footprint_mm].max()
-    assert middle < 1e-9 if tool == "suction" else middle > 0.9 * pressure.max()
+    alignment = abs(spread.eigenvectors[:, 1] @ gesture.shaft[:2]) / np.linalg.norm(gesture.shaft[:2])
+    assert {"forceps": alignment > 0.99, "spatula": alignment < 0.1}.get(tool, True)
+    middle_pressure = pressure[np.linalg.norm(flat, axis=1) < 0.1 * gesture.footprint_mm].max()
+    assert middle_pressure < 1e-9 if tool == "suction" else middle_pressure > 0.9 * pressure.max()
 
 
 def test_instruments_are_apart_and_none_points_at_the_lens() -> None:
-    many = synth.Job.model_validate({"sequences": 4, "fem": {"instruments": 3}, "render": {"tilt_deg": 40}})
-    for case in (draw_scenario(many, k) for k in range(4)):
-        lens = camera.place(case.view, read_lens(many.render)).centre
+    job = synth.Job.model_validate({"sequences": 4, "fem": {"instruments": 3}, "render": {"tilt_deg": 40}})
+    for case in (draw_scenario(job, k) for k in range(4)):
+        lens = camera.place(case.view, read_lens(job.render)).centre
         bars = [scenario._rings(gesture) for gesture in case.gestures]
         for k, gesture in enumerate(case.gestures):
             sight = lens - np.append(gesture.point_mm, 0)
@@ -163,8 +176,8 @@ def test_instruments_are_apart_and_none_points_at_the_lens() -> None:
 
 
 def test_times_are_parts_of_the_sequence_and_must_lie_in_it() -> None:
-    for given in (["100 ms", "200ms", "400 ms", "600 ms"], ["0.1 s", "0.2s", "0.4 s", " .6 s"]):
-        (gesture,) = draw_scenario(job({"timing": given}), 0).gestures
+    for timing in (["100 ms", "200ms", "400 ms", "600 ms"], ["0.1 s", "0.2s", "0.4 s", " .6 s"]):
+        (gesture,) = draw_scenario(make_job({"timing": timing}), 0).gestures
         assert gesture.timing == pytest.approx(np.array([0.1, 0.2, 0.4, 0.6]) / (23 / 25))
     with pytest.raises(UserError, match=r"1200 ms.*920 ms"):
         reader.parse_job("fem: {instrument_list: [{timing: [1 ms, 2 ms, 3 ms, 1200 ms]}]}", "", Path())

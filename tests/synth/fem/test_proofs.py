@@ -36,14 +36,14 @@ def cubes(size: tuple[float, float, float], count: float) -> Tets:
     return box(*tetrahedra.bricks(np.array(size), count), size)
 
 
-def boussinesq(at: Floats, young: float, poisson: float) -> Floats:
+def boussinesq(points: Floats, young: float, poisson: float) -> Floats:
     """Displacement of a half-space z <= 0 under a unit force in -z at the origin (Johnson 1985, 3.2)."""
     shear = young / (2 * (1 + poisson))
-    flat, depth = np.hypot(at[:, 0], at[:, 1]), -at[:, 2]
-    far = np.sqrt(flat**2 + depth**2)
-    down = (2 * (1 - poisson) / far + depth**2 / far**3) / (4 * np.pi * shear)
-    out = (depth / far**3 - (1 - 2 * poisson) / (far * (far + depth))) / (4 * np.pi * shear)
-    return np.column_stack([out * at[:, 0], out * at[:, 1], -down])
+    radius, depth = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
+    distance = np.sqrt(radius**2 + depth**2)
+    down = (2 * (1 - poisson) / distance + depth**2 / distance**3) / (4 * np.pi * shear)
+    out = (depth / distance**3 - (1 - 2 * poisson) / (distance * (distance + depth))) / (4 * np.pi * shear)
+    return np.column_stack([out * points[:, 0], out * points[:, 1], -down])
 
 
 @pytest.mark.parametrize("poisson", [0.4, 0.49])
@@ -51,7 +51,7 @@ def test_kernel_on_a_half_space(poisson: float) -> None:
     """w0 = 1.0186 (1 - nu^2) F / (a E) under (1 - (r/a)^2)^2; the far boundary carries the solution."""
     a, size = 1.0, (4.0, 4.0, 2.0)
     points, cells = tetrahedra.bricks(np.array(size), 20)
-    points, cells = refine(points, cells, lambda at: 0.25 + np.linalg.norm(at, axis=1), 2000)
+    points, cells = refine(points, cells, lambda x: 0.25 + np.linalg.norm(x, axis=1), 2000)
     tets = box(points, cells, size)
     # The kernel as 24 rings of 24 point forces each.
     node, weight = np.polynomial.legendre.leggauss(24)
@@ -81,9 +81,9 @@ def test_uniaxial_neo_hookean() -> None:
     tets, poisson, stretch = cubes((2.0, 2.0, 2.0), 8), 0.4, 1.5
     system = assemble(tets, "neo-hookean", poisson)
     points = tets.points + np.array([1.0, 1.0, 2.0])
-    held = points < 1e-9
-    held[:, 2] |= points[:, 2] > 2 - 1e-9
-    free = np.flatnonzero(~held.ravel())
+    fixed_dofs = points < 1e-9
+    fixed_dofs[:, 2] |= points[:, 2] > 2 - 1e-9
+    free = np.flatnonzero(~fixed_dofs.ravel())
     system = replace(system, free=free, factor=splu(system.stiffness[free][:, free].tocsc()))
     start = points * [stretch**-0.4 - 1, stretch**-0.4 - 1, stretch - 1]
     u = newton(system, np.zeros_like(start), start, tolerance=1e-13)
@@ -97,19 +97,19 @@ def test_uniaxial_neo_hookean() -> None:
 
 @pytest.mark.slow
 def test_manufactured_solution_converges() -> None:
-    coarse, fine = (_manufactured(n) for n in (4, 8))
-    assert np.log2(coarse / fine) == pytest.approx(3.0, abs=0.1)
+    coarse_error, fine_error = (_measure_error(n) for n in (4, 8))
+    assert np.log2(coarse_error / fine_error) == pytest.approx(3.0, abs=0.1)
 
 
-def _manufactured(n: int) -> float:
+def _measure_error(n: int) -> float:
     """L2 error of u = (1, 1/2, -1) sin x sin y sin z (times pi, on the unit cube) under its body force."""
     tets = cubes((1.0, 1.0, 1.0), n**3)
     tets = replace(tets, fixed=tets.fixed | (tets.points[:, 2] > -1e-9))
-    way, shift, k = np.array([1.0, 0.5, -1.0]), np.array([0.5, 0.5, 1.0]), np.pi
+    amplitude, shift, k = np.array([1.0, 0.5, -1.0]), np.array([0.5, 0.5, 1.0]), np.pi
     mu, lam = lame(1.0, 0.0)
 
     def exact(x: Floats) -> Floats:
-        return np.prod(np.sin(k * (x + shift)), axis=-1)[..., None] * way
+        return np.prod(np.sin(k * (x + shift)), axis=-1)[..., None] * amplitude
 
     def body(x: Floats) -> Floats:
         s, c = np.sin(k * (x + shift)), np.cos(k * (x + shift))
@@ -119,47 +119,47 @@ def _manufactured(n: int) -> float:
                 rest = [m for m in range(3) if m not in (i, j)]
                 factor = c[..., i] * c[..., j] if i != j else -s[..., i]
                 second[..., i, j] = k * k * factor * np.prod(s[..., rest], axis=-1)
-        return 3 * k * k * mu * exact(x) - (lam + mu) * second @ way
+        return 3 * k * k * mu * exact(x) - (lam + mu) * second @ amplitude
 
-    at, weight = get_quadrature(RefTet, 5)
-    bary = np.column_stack([1 - at.sum(axis=0), at.T])
+    nodes, weight = get_quadrature(RefTet, 5)
+    bary = np.column_stack([1 - nodes.sum(axis=0), nodes.T])
     corner = tets.points[tets.cells[:, :4]]
     volume = bary_slope(corner)[1]
-    place = np.einsum("qc,mcd->mqd", bary, corner)
+    positions = np.einsum("qc,mcd->mqd", bary, corner)
     value = shape(bary)
-    local = np.einsum("m,q,qn,mqd->mnd", 6 * volume, weight, value, body(place))
+    local = np.einsum("m,q,qn,mqd->mnd", 6 * volume, weight, value, body(positions))
     load = np.zeros_like(tets.points)
     np.add.at(load, tets.cells, local)
     system = assemble(tets, "linear", 0.0)
     u = system.solve(load)
-    gap = np.einsum("qn,mnd->mqd", value, u[tets.cells]) - exact(place)
-    return float(np.sqrt(np.einsum("m,q,mqd->", 6 * volume, weight, gap**2)))
+    error = np.einsum("qn,mnd->mqd", value, u[tets.cells]) - exact(positions)
+    return float(np.sqrt(np.einsum("m,q,mqd->", 6 * volume, weight, error**2)))
 
 
-def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
+def load_block(law: str, load: float, kind: str) -> tuple[System, Floats]:
     """A block under one contact, and the load for E = 1 kPa."""
     tets = tetrahedra.block(700, ((2.0, 1.0, 4.0),))
     vertices, faces = patch()
     area = surface_embedding.vertex_area(vertices, faces)
     kernel = tool_gesture.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area
-    way = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
-    force = surface_embedding.embed(tets, vertices).gather(np.outer(kernel, 16.0 * load * way))
+    direction = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
+    force = surface_embedding.embed(tets, vertices).gather(np.outer(kernel, 16.0 * load * direction))
     return assemble(tets, law, 0.4), force
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "kind"), [("corotational", "pull"), ("neo-hookean", "push")])
 def test_fast_solver_agrees_with_newtons_method(law: str, kind: str) -> None:
-    system, load = loaded(law, 0.15, kind)
-    part = np.array([0.0, 0.4, 0.8, 1.0])
-    path = equilibrium.solve_path(system, part[:, None, None] * load, 0.15 * part)
+    system, load = load_block(law, 0.15, kind)
+    fractions = np.array([0.0, 0.4, 0.8, 1.0])
+    path = equilibrium.solve_path(system, fractions[:, None, None] * load, 0.15 * fractions)
     exact = newton(system, load, path.displacement[-1], 1e-8)
     assert np.linalg.norm(path.displacement[-1] - exact) <= 1e-3 * np.linalg.norm(exact)
 
 
 def test_a_corner_that_is_pressed_flat_on_the_surface_is_refused() -> None:
     """No quadrature point is near it."""
-    system, load = loaded("corotational", 0.1, "push")
+    system, load = load_block("corotational", 0.1, "push")
     top = int(np.abs(load).sum(axis=1)[system.mesh.cells[:, :4]].max(axis=1).argmax())
     corner = system.mesh.cells[top, :4][np.abs(load).sum(axis=1)[system.mesh.cells[top, :4]].argmax()]
     u = np.zeros_like(load)

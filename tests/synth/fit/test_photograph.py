@@ -13,13 +13,13 @@ from synth.errors import UserError
 from synth.fit import fitting
 from synth.fit.fitting import fit_colours
 from synth.fit.photograph import Compression, Photograph, find_cortex, measure, read_photograph
-from synth.render.camera.camera_sensor import processed
-from synth.render.camera.colour_processing import CAMERAS, encoded
+from synth.render.camera.camera_sensor import process_colours
+from synth.render.camera.colour_processing import CAMERAS, encode_srgb
 
 REFERENCE = Path(__file__).parents[4] / "shared" / "reference" / "cortex_photo.jpg"
 
 
-def scene(width: int = 640, height: int = 480, *, tool: bool = True) -> np.ndarray:
+def draw_scene(width: int = 640, height: int = 480, *, tool: bool = True) -> np.ndarray:
     """An opening of tissue in a bloody rim on a dark blue drape, with a steel rod across it (H, W, 3)."""
     rng = np.random.default_rng(0)
     picture = np.full((height, width, 3), (20, 25, 60), np.uint8)
@@ -35,53 +35,58 @@ def scene(width: int = 640, height: int = 480, *, tool: bool = True) -> np.ndarr
     return np.clip(picture + rng.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
 
 
-def opening(width: int = 640, height: int = 480) -> np.ndarray:
+def draw_opening(width: int = 640, height: int = 480) -> np.ndarray:
     y, x = np.mgrid[:height, :width]
     return np.asarray(np.hypot(x - width // 2, y - height // 2) < 0.38 * height)
 
 
-def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
-    Image.fromarray(rgb).save(path, **how)
+def write_picture(path: Path, rgb: np.ndarray, **settings: object) -> Path:
+    Image.fromarray(rgb).save(path, **settings)
     return path
 
 
 def test_the_opening_is_detected_without_the_instrument() -> None:
-    with_tool, truth = find_cortex(scene(), 0.08), opening()
+    with_tool, truth = find_cortex(draw_scene(), 0.08), draw_opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
     rod = (rod > 0) & truth
     assert (with_tool & rod).sum() < 0.1 * rod.sum()
     assert (with_tool & ~truth).sum() < 0.03 * truth.sum()
     assert (with_tool & truth).sum() > 0.6 * (truth & ~rod).sum()
-    assert (find_cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
+    assert (find_cortex(draw_scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
 
 
 def test_the_compression_of_a_jpeg_is_read_and_reproduced() -> None:
-    rgb = scene()
-    packed = io.BytesIO()
-    Image.fromarray(rgb).save(packed, "JPEG", quality=60, subsampling="4:2:0")
-    found = Compression.of_file(packed.getvalue(), 1.0)
-    assert found.chroma == "4:2:0"
-    once = np.asarray(Image.open(io.BytesIO(packed.getvalue())))
-    assert np.abs(found.apply(rgb).astype(int) - once).mean() < 0.05
+    rgb = draw_scene()
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, "JPEG", quality=60, subsampling="4:2:0")
+    compression = Compression.of_file(buffer.getvalue(), 1.0)
+    assert compression.chroma == "4:2:0"
+    jpeg = np.asarray(Image.open(io.BytesIO(buffer.getvalue())))
+    assert np.abs(compression.apply(rgb).astype(int) - jpeg).mean() < 0.05
 
 
 def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
-    dark = written(tmp_path / "dark.png", np.zeros((300, 400, 3), np.uint8))
-    small = written(tmp_path / "small.png", scene(200, 150))
-    photo = written(tmp_path / "photo.png", scene())
-    mask = written(tmp_path / "mask.png", np.zeros((300, 400), np.uint8))
-    for path, drawn in ((dark, None), (small, None), (photo, mask), (tmp_path / "none.jpg", None)):
+    dark_photo = write_picture(tmp_path / "dark.png", np.zeros((300, 400, 3), np.uint8))
+    small_photo = write_picture(tmp_path / "small.png", draw_scene(200, 150))
+    photo = write_picture(tmp_path / "photo.png", draw_scene())
+    mask = write_picture(tmp_path / "mask.png", np.zeros((300, 400), np.uint8))
+    for path, mask_path in (
+        (dark_photo, None),
+        (small_photo, None),
+        (photo, mask),
+        (tmp_path / "none.jpg", None),
+    ):
         with pytest.raises(UserError):
-            read_photograph(path, 35.0, drawn)
+            read_photograph(path, 35.0, mask_path)
 
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="the reference photograph is missing")
 def test_the_cortex_of_the_reference_photograph_is_detected(tmp_path: Path) -> None:
     photo = Path(shutil.copy(REFERENCE, tmp_path / "photo.jpg"))
-    found = read_photograph(photo, 110.0, None)
-    assert 1200 < found.cortex_mm2 < 2400, "the opening is some 55 mm wide"
-    red, green = (found.rgb[..., k][found.usable].astype(float) for k in range(2))
+    photograph = read_photograph(photo, 110.0, None)
+    assert 1200 < photograph.cortex_mm2 < 2400, "the opening is some 55 mm wide"
+    red, green = (photograph.rgb[..., k][photograph.usable].astype(float) for k in range(2))
     assert np.mean(green < 0.42 * red) < 0.15, "little of it is blood"
 
 
@@ -89,7 +94,7 @@ MM = 0.0547
 SIZE = (360, 480)
 
 
-def lines(count: int, width_px: int) -> np.ndarray:
+def draw_vessels(count: int, width_px: int) -> np.ndarray:
     """Linear light of tissue with a little grain, crossed by horizontal red vessels, (H, W, 3)."""
     grain = 1 + 0.01 * np.random.default_rng(0).standard_normal(SIZE)
     picture = np.array([0.8, 0.6, 0.4]) * grain[..., None]
@@ -99,7 +104,7 @@ def lines(count: int, width_px: int) -> np.ndarray:
 
 
 def test_noise_of_known_size_is_found_and_blur_lowers_sharpness() -> None:
-    picture = np.clip(np.rint(255 * encoded(lines(8, 3))), 0, 255)
+    picture = np.clip(np.rint(255 * encode_srgb(draw_vessels(8, 3))), 0, 255)
     noise = 3 * np.random.default_rng(1).standard_normal(SIZE)[..., None]
     usable = np.ones(SIZE, bool)
     noisy = np.clip(picture + noise, 0, 255).astype(np.uint8)
@@ -115,10 +120,10 @@ def test_colours_of_the_same_tissue_are_recovered() -> None:
     blood = rng.random((9000, 1)) ** 2
     light = np.array([0.95, 0.8, 0.5]) * np.exp(-blood * [0.3, 1.9, 2.3]) * rng.uniform(0.5, 1.1, (9000, 1))
     camera, light = CAMERAS[3], light.astype(np.float32)
-    video = np.clip(processed(light[None], *camera)[0], 0, 1)
-    found = np.clip(processed(light[None], *fit_colours(light, video)[0])[0], 0, 1)
-    before = np.clip(processed(light[None], *CAMERAS[0])[0], 0, 1)
-    assert np.abs(found - video).mean() < 0.3 * np.abs(before - video).mean()
+    video = np.clip(process_colours(light[None], *camera)[0], 0, 1)
+    fitted_video = np.clip(process_colours(light[None], *fit_colours(light, video)[0])[0], 0, 1)
+    default_video = np.clip(process_colours(light[None], *CAMERAS[0])[0], 0, 1)
+    assert np.abs(fitted_video - video).mean() < 0.3 * np.abs(default_video - video).mean()
 
 
 @pytest.mark.slow
@@ -127,12 +132,12 @@ def test_the_camera_of_a_photograph_of_another_brain_is_recovered() -> None:
     # Healthy, pale and oedematous tissue differ less than anatomies do, once the camera's colours are free.
     frame = fitting.render("hyperaemic", 400, MM, 7)
     rgb = frame.record({"vignette": 0.4, "blur": 1.0, "full_well": 3000.0, "read_noise": 6.0})
-    packed = io.BytesIO()
-    Image.fromarray(rgb).save(packed, "JPEG", quality=90, subsampling="4:2:0")
-    compression = Compression.of_file(packed.getvalue(), 1.0)
-    found = fitting.fit_camera(Photograph(np.asarray(Image.open(packed)), frame.usable, MM, compression))
-    assert found["appearance"]["families"] == ["hyperaemic"]
-    sensor = found["sensor"]
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, "JPEG", quality=90, subsampling="4:2:0")
+    compression = Compression.of_file(buffer.getvalue(), 1.0)
+    fit = fitting.fit_camera(Photograph(np.asarray(Image.open(buffer)), frame.usable, MM, compression))
+    assert fit["appearance"]["families"] == ["hyperaemic"]
+    sensor = fit["sensor"]
     assert sensor["vignette"] == pytest.approx(0.4, abs=0.15)
     assert sensor["blur_px"] == pytest.approx(1.0, abs=0.25)
     assert sensor["full_well"] == pytest.approx(3000, rel=0.6)

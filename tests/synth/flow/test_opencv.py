@@ -16,10 +16,10 @@ from synth.plugins import ESTIMATORS
 
 @pytest.mark.parametrize(("name", "bound_px"), [("opencv-tvl1", 0.05), ("dis", 0.08)])
 def test_translation(name: str, bound_px: float) -> None:
-    fine = np.round(255 * cortex(320, np.random.default_rng(3))).astype(np.uint8)
-    rest, now = fine[40:200, 40:200], fine[37:197, 35:195]  # the picture moves by +5, +3
-    every = np.ones((160, 160), bool)
-    flow, confidence = estimator.create(name).flow(rest, now, every, every)
+    picture = np.round(255 * cortex(320, np.random.default_rng(3))).astype(np.uint8)
+    rest, now = picture[40:200, 40:200], picture[37:197, 35:195]  # the picture moves by +5, +3
+    full_mask = np.ones((160, 160), bool)
+    flow, confidence = estimator.create(name).flow(rest, now, full_mask, full_mask)
     inner = (slice(20, -20), slice(20, -20))
     assert np.linalg.norm(flow - [5.0, 3.0], axis=-1)[inner].mean() < bound_px
     assert confidence[inner].min() > 0.9
@@ -41,21 +41,23 @@ def test_the_estimator_of_a_plug_in_is_found_by_its_entry_point(
 ) -> None:
     with pytest.raises(UserError):
         estimator.create("my-net")
-    points = {ESTIMATORS.group: {"my-net": "learned_flow:Learned"}}
-    tiny_package.install(tmp_path, "learned_flow", _PLUGIN, points, monkeypatch)
+    entry_points = {ESTIMATORS.group: {"my-net": "learned_flow:Learned"}}
+    tiny_package.install(tmp_path, "learned_flow", _PLUGIN, entry_points, monkeypatch)
     assert "my-net" in ESTIMATORS.names()
     assert Job.model_validate({"flow": {"backend": "my-net"}}).flow.backend == "my-net"
     frames = np.zeros((2, 24, 32, 3), np.uint8)
-    found = track.track("my-net", frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
-    np.testing.assert_array_equal(found.flow[1], np.broadcast_to([1.0, -2.0], (24, 32, 2)))
-    assert found.trusted.all()
+    result = track.track("my-net", frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
+    np.testing.assert_array_equal(result.flow[1], np.broadcast_to([1.0, -2.0], (24, 32, 2)))
+    assert result.trusted.all()
 
 
-@pytest.mark.parametrize("wrong", ["f, 1.5 * c", "f, c - 1.5", "np.nan * f, c", "f[1:], c", "f", "exit(0)"])
-def test_invalid_results_of_an_estimator_are_reported_with_its_name(wrong: str) -> None:
+@pytest.mark.parametrize(
+    "expression", ["f, 1.5 * c", "f, c - 1.5", "np.nan * f, c", "f[1:], c", "f", "exit(0)"]
+)
+def test_invalid_results_of_an_estimator_are_reported_with_its_name(expression: str) -> None:
     class Wrong:
         def flow(self, rest: Any, *others: Any) -> Any:
-            return eval(wrong, {"np": np, "f": np.zeros((24, 32, 2)), "c": np.ones((24, 32))})
+            return eval(expression, {"np": np, "f": np.zeros((24, 32, 2)), "c": np.ones((24, 32))})
 
     frames = np.zeros((2, 24, 32, 3), np.uint8)
     with pytest.raises(UserError, match="Wrong"):

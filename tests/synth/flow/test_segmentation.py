@@ -26,11 +26,17 @@ def test_bundled_weights_are_small_and_those_of_their_card() -> None:
     for file in (segmentation.WEIGHTS, correction.WEIGHTS, depth_correction.WEIGHTS):
         card = json.loads(file.with_suffix(".json").read_text())
         assert file.stat().st_size <= 1_500_000
-        parts = [
-            one for one in onnx.load(file).graph.initializer if one.data_type == onnx.TensorProto.FLOAT16
+        tensors = [
+            tensor
+            for tensor in onnx.load(file).graph.initializer
+            if tensor.data_type == onnx.TensorProto.FLOAT16
         ]
-        learnt = [one for one in parts if one.dims and not re.search("running|^mean|^deviation", one.name)]
-        assert sum(int(np.prod(one.dims)) for one in learnt) == card["parameters"]
+        parameters = [
+            tensor
+            for tensor in tensors
+            if tensor.dims and not re.search("running|^mean|^deviation", tensor.name)
+        ]
+        assert sum(int(np.prod(tensor.dims)) for tensor in parameters) == card["parameters"]
 
 
 @pytest.mark.slow
@@ -38,16 +44,16 @@ def test_bundled_weights_are_small_and_those_of_their_card() -> None:
 @pytest.mark.parametrize("net", [SegmentationNet(), CorrectionNet()], ids=["segmentation", "correction"])
 def test_onnx_files_give_what_pytorch_gives_at_any_size(net: torch.nn.Module, tmp_path: Path) -> None:
     with torch.no_grad():
-        for one in net.parameters():
-            one.copy_(torch.randn(one.shape).half() * one[0].numel() ** -0.5)
+        for parameter in net.parameters():
+            parameter.copy_(torch.randn(parameter.shape).half() * parameter[0].numel() ** -0.5)
     channels = 6 if isinstance(net, SegmentationNet) else correction.CHANNELS
     write_onnx(net, tmp_path / "net.onnx", channels)
     for size in ((64, 96), (128, 64)):
         planes = np.random.default_rng(1).normal(size=(channels, *size)).astype(np.float32)
         with torch.no_grad():
             expected = net.eval()(torch.from_numpy(planes)[None])[0].numpy()
-        found = onnx_network.run(tmp_path / "net.onnx", planes)
-        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+        output = onnx_network.run(tmp_path / "net.onnx", planes)
+        np.testing.assert_allclose(output, expected, atol=1e-4 * np.abs(expected).max())
     (tmp_path / "bad.onnx").write_bytes(b"no network")
     with pytest.raises(UserError):
         onnx_network.run(tmp_path / "bad.onnx", planes)
@@ -70,28 +76,30 @@ def test_a_rod_is_found_whole_and_bare_tissue_is_not_masked(size: tuple[int, int
     rest = tissue(height, width)
     rod = np.zeros(size, np.uint8)
     cv2.line(rod, (width, height // 8), (width // 2, height // 2), 255, width // 16, cv2.LINE_AA)
-    share = cv2.GaussianBlur(rod / 255, (0, 0), width / 500)[..., None]
-    frame = np.clip(rest * (1 - share) + share * grey, 0, 255).astype(np.uint8)
-    found, true = segment(rest, frame).instrument > 0.5, share[..., 0] > 0.5
-    assert found.shape == size
-    assert np.count_nonzero(found & true) > 0.5 * np.count_nonzero(found | true)
+    coverage = cv2.GaussianBlur(rod / 255, (0, 0), width / 500)[..., None]
+    frame = np.clip(rest * (1 - coverage) + coverage * grey, 0, 255).astype(np.uint8)
+    instrument, true_rod = segment(rest, frame).instrument > 0.5, coverage[..., 0] > 0.5
+    assert instrument.shape == size
+    assert np.count_nonzero(instrument & true_rod) > 0.5 * np.count_nonzero(instrument | true_rod)
     assert segment(rest, rest).hidden.mean() < 0.01
 
 
-@pytest.mark.parametrize("at", [(30, 100), (80, 40), (90, 120), pytest.param((50, 70), marks=ON_VESSEL)])
-def test_highlights_join_given_instruments(at: tuple[int, int]) -> None:
+@pytest.mark.parametrize("centre", [(30, 100), (80, 40), (90, 120), pytest.param((50, 70), marks=ON_VESSEL)])
+def test_highlights_join_given_instruments(centre: tuple[int, int]) -> None:
     rest = tissue(120, 160)
-    away = np.square(np.indices((120, 160)) - np.reshape(at, (2, 1, 1))).sum(0)
-    wet = np.clip(rest + 250 * np.exp(-away / (2 * 4.0**2))[..., None], 0, 255).astype(np.uint8)
+    squared_distance = np.square(np.indices((120, 160)) - np.reshape(centre, (2, 1, 1))).sum(0)
+    wet_picture = np.clip(rest + 250 * np.exp(-squared_distance / (2 * 4.0**2))[..., None], 0, 255).astype(
+        np.uint8
+    )
     tool = np.stack([rest[..., 0] < 0, np.indices((120, 160))[1] < 20])
-    found = with_highlights(np.stack([rest, wet]), tool)
-    assert found[1][at]
-    assert found[1, :, :20].all()
-    assert found[1][~tool[1] & (away > 20**2)].mean() < 0.01
+    masks = with_highlights(np.stack([rest, wet_picture]), tool)
+    assert masks[1][centre]
+    assert masks[1, :, :20].all()
+    assert masks[1][~tool[1] & (squared_distance > 20**2)].mean() < 0.01
 
 
 def test_a_forceps_is_found_on_warped_cortex() -> None:
     (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
-    found, tool = segment(pair.rest, pair.now).hidden, ~pair.now_usable
-    assert found[tool].mean() > 0.8
-    assert found[~tool].mean() < 0.1
+    hidden, tool = segment(pair.rest, pair.now).hidden, ~pair.now_usable
+    assert hidden[tool].mean() > 0.8
+    assert hidden[~tool].mean() < 0.1

@@ -16,7 +16,7 @@ from synth.flow.image import Level
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 
-def _error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def _measure_error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(flow - truth, axis=-1)
 
 
@@ -24,7 +24,7 @@ def test_pull_with_tool_highlights_and_light() -> None:
     mean, contact, hidden = [], [], []
     for pair in pairs(Recipe(), 3, 22):
         flow, trust = Tvl1().flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)
-        error = _error(flow, pair.flow)
+        error = _measure_error(flow, pair.flow)
         mean.append(error[pair.inside & ~pair.hidden].mean())
         contact.append(error[pair.contact & ~pair.hidden].mean())
         hidden.append(error[pair.hidden].mean())
@@ -37,8 +37,8 @@ def test_pull_with_tool_highlights_and_light() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (31, 57)])
 def test_small_and_odd_pictures(size: tuple[int, int]) -> None:
     picture = np.random.default_rng(0).integers(0, 255, (*size, 3), dtype=np.uint8)
-    every = np.ones(size, bool)
-    flow, trust = Tvl1().flow(picture, picture[::-1].copy(), every, every)
+    full_mask = np.ones(size, bool)
+    flow, trust = Tvl1().flow(picture, picture[::-1].copy(), full_mask, full_mask)
     assert flow.shape == (*size, 2)
     assert np.isfinite(flow).all()
     assert np.isfinite(trust).all()
@@ -47,10 +47,10 @@ def test_small_and_odd_pictures(size: tuple[int, int]) -> None:
 def test_blank_or_masked_pictures_are_not_trusted() -> None:
     rng = np.random.default_rng(1)
     (pair,) = pairs(CLEAN, 1, 9)
-    every = np.ones(pair.rest.shape[:2], bool)
+    full_mask = np.ones(pair.rest.shape[:2], bool)
     blank = np.clip(rng.normal(128, 2, pair.rest.shape), 0, 255).astype(np.uint8)
-    for now, usable in ((blank, every), (pair.now, ~every)):
-        flow, trust = Tvl1().flow(pair.rest, now, every, usable)
+    for now, usable in ((blank, full_mask), (pair.now, ~full_mask)):
+        flow, trust = Tvl1().flow(pair.rest, now, full_mask, usable)
         assert np.isfinite(flow).all()
         assert trust.mean() < 0.25
 
@@ -78,7 +78,7 @@ def test_tracker_recovers_after_blank_frames() -> None:
         shot = stage.against(rest, share, rng)
         flow, trust = tracker.step(shot.now, ~shot.now_usable)
         assert tracker.trusted
-        assert _error(flow, shot.flow)[~shot.hidden & shot.inside].mean() < 0.25
+        assert _measure_error(flow, shot.flow)[~shot.hidden & shot.inside].mean() < 0.25
         assert trust[shot.hidden].mean() < 0.05
 
 
@@ -87,15 +87,15 @@ def test_flow_from_rest_to_now_does_not_drift() -> None:
     stage = Stage.set(Recipe(size=96, pull=4.0, tool=0.0, noise=3.0), rng := np.random.default_rng(12))
     tracker = track.Tracker("tvl1", *(rest := stage.rest(rng))[:2], np.ones((96, 96), bool))
     shots = [stage.against(rest, 0.5 - 0.5 * np.cos(np.pi * t / 6), rng) for t in range(1, 37)]
-    errors = [_error(tracker.step(one.now, ~one.now_usable)[0], one.flow).mean() for one in shots]
+    errors = [_measure_error(tracker.step(shot.now, ~shot.now_usable)[0], shot.flow).mean() for shot in shots]
     assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
 
 
 def test_large_motion_of_a_small_area_is_followed_and_a_wrong_flow_is_let_go() -> None:
     recipe = Recipe(size=128, pull=16.0, reach=0.12, tool=16.0, contrast=0.3)
     stage = Stage.set(recipe, rng := np.random.default_rng(12))
-    rest, every = stage.rest(rng), np.ones((128, 128), bool)
-    tracker = track.Tracker(Tvl1(corrected=False), *rest[:2], every)
+    rest, full_mask = stage.rest(rng), np.ones((128, 128), bool)
+    tracker = track.Tracker(Tvl1(corrected=False), *rest[:2], full_mask)
     for step in range(1, 9):
         shot = stage.against(rest, step / 8, rng)
         flow, _ = tracker.step(shot.now, ~shot.now_usable)
@@ -103,21 +103,21 @@ def test_large_motion_of_a_small_area_is_followed_and_a_wrong_flow_is_let_go() -
     contact = (length > 0.6 * length.max()) & shot.inside & ~shot.hidden
     # With coarse levels that smooth all of the last flow it is 0.80.
     assert (flow * shot.flow)[contact].sum() / (shot.flow[contact] ** 2).sum() > 0.86
-    still = stage.against(rest, 0.0, rng)
-    found, _ = Tvl1(corrected=False).flow(rest[0], still.now, ~rest[1], still.now_usable, flow)
-    assert np.linalg.norm(found, axis=-1)[~still.hidden].mean() < 0.5
+    rest_shot = stage.against(rest, 0.0, rng)
+    rest_flow, _ = Tvl1(corrected=False).flow(rest[0], rest_shot.now, ~rest[1], rest_shot.now_usable, flow)
+    assert np.linalg.norm(rest_flow, axis=-1)[~rest_shot.hidden].mean() < 0.5
 
 
 class _FixedConfidence:
     """An estimator of given confidence, with and without the surroundings."""
 
     def __init__(self, alone: float, around: float) -> None:
-        self.sure, self.shown = (alone, around), []
+        self.confidences, self.widened_calls = (alone, around), []
 
     def flow(self, rest, now, rest_usable, now_usable, initial=None):  # type: ignore[no-untyped-def]
-        self.shown.append(bool(rest_usable[0, 0]))
-        size, sure = rest_usable.shape, self.sure[self.shown[-1]]
-        return np.zeros((*size, 2), "f4"), np.full(size, sure, "f4")
+        self.widened_calls.append(bool(rest_usable[0, 0]))
+        size, confidence = rest_usable.shape, self.confidences[self.widened_calls[-1]]
+        return np.zeros((*size, 2), "f4"), np.full(size, confidence, "f4")
 
 
 @pytest.mark.parametrize(("alone", "around"), [(0.3, 0.9), (0.3, 0.4), (0.8, 1.0)])
@@ -128,10 +128,10 @@ def test_surroundings_are_tracked_where_tissue_alone_has_low_confidence(alone: f
     tracker = track.Tracker(estimator, picture, ~tissue & False, tissue)
     for _ in range(6):
         _, confidence = tracker.step(picture, ~tissue & False)
-    assert tracker.widened == widened == estimator.shown[-1]
+    assert tracker.widened == widened == estimator.widened_calls[-1]
     assert confidence[16, 16] == pytest.approx(around if widened else alone)
     assert not confidence[~tissue].any()
-    assert sum(estimator.shown) <= (6 if widened else 3), "tries with the surroundings are limited"
+    assert sum(estimator.widened_calls) <= (6 if widened else 3), "tries with the surroundings are limited"
 
 
 def test_a_warp_solves_the_linear_system_that_its_energy_has_without_clipping() -> None:
@@ -142,8 +142,8 @@ def test_a_warp_solves_the_linear_system_that_its_energy_has_without_clipping() 
     mask, weight = (rng.random(shape) > 0.2).astype("f4"), rng.uniform(0.1, 0.4, shape).astype("f4")
     start, state = rng.normal(0, 0.2, (2, *shape)).astype("f4"), tvl1.new_state(*shape)
     tvl1.linearise(before, after, mask, weight, start, numbers, state)
-    found = start.copy()
-    tvl1.primal_dual(found, state, tau, 3000)
+    solution = start.copy()
+    tvl1.primal_dual(solution, state, tau, 3000)
     scale = np.array([1, gamma, gamma])
     residual = scale[:, None] * (after - before)[:3].reshape(3, -1)
     mean = 0.5 * scale[:, None, None] * (after + before)[[[1, 2], [3, 4], [4, 5]]].reshape(3, 2, -1)
@@ -158,7 +158,7 @@ def test_a_warp_solves_the_linear_system_that_its_energy_has_without_clipping() 
     offset = residual - (mean * start.reshape(2, -1)).sum(1)
     pull = -(trust * (mean * offset[:, None]).sum(0)).ravel()
     expected = spsolve((sp.bmat(data) + smooth).tocsc(), pull).reshape(2, *shape)
-    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(solution, expected, atol=2e-3 * np.abs(expected).max())
     assert np.abs(expected - start).max() > 0.2
     assert max(np.abs(np.diff(expected, axis=k)).max() for k in (1, 2)) < huber
 
@@ -167,7 +167,7 @@ def test_a_warp_solves_the_linear_system_that_its_energy_has_without_clipping() 
 def test_means_equal_those_of_pytorch(shape: tuple[int, int]) -> None:
     field = torch.randn(3, *shape, generator=torch.Generator().manual_seed(1))
     expected = F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)
-    np.testing.assert_allclose(image.halved(field.numpy()), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(image.halve(field.numpy()), expected, rtol=1e-5, atol=1e-6)
     for radius in (1, 3):
         wide = 2 * radius + 1
         rows = F.avg_pool2d(field, (1, wide), 1, (0, radius), count_include_pad=False)
@@ -189,21 +189,25 @@ def test_a_diverged_flow_samples_at_the_border() -> None:
     assert np.isfinite(tvl1.solve([level], flow, TVL1Settings(warps=1, median=False))).all()
 
 
-def _described(mirrored: bool, x: float = 0.4, y: float = -0.25) -> np.ndarray:
+def _describe(mirrored: bool, x: float = 0.4, y: float = -0.25) -> np.ndarray:
     """Features of a texture that moved by (x, y) px, with a flow of (0, 0)."""
     rng = np.random.default_rng(3)
-    coloured = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
+    picture = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
     shift = np.float32([[1, 0, x], [0, 1, y]])
-    moved = cv2.warpAffine(coloured, shift, (88, 104), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    pictures = np.clip([coloured, moved], 0, 255).astype(np.uint8)
+    moved_picture = cv2.warpAffine(
+        picture, shift, (88, 104), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    pictures = np.clip([picture, moved_picture], 0, 255).astype(np.uint8)
     rest, now = np.ascontiguousarray(pictures[:, :, :: -1 if mirrored else 1])
     greys = rest[..., 1] / np.float32(12), now[..., 1] / np.float32(12)
-    every, flow = np.ones((104, 88), bool), np.zeros((104, 88, 2), np.float32)
-    return correction.describe(rest, now, every, greys, np.float32(every), flow, np.float32(every))
+    full_mask, flow = np.ones((104, 88), bool), np.zeros((104, 88, 2), np.float32)
+    return correction.describe(
+        rest, now, full_mask, greys, np.float32(full_mask), flow, np.float32(full_mask)
+    )
 
 
 def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -> None:
-    features, mirrored = _described(mirrored=False), _described(mirrored=True)
+    features, mirrored = _describe(mirrored=False), _describe(mirrored=True)
     assert features.shape == (correction.CHANNELS, 26, 22)
     for x, y in correction.VECTORS[:4]:
         np.testing.assert_allclose(np.median(features[x, 3:-3, 3:-3]), 0.4, atol=0.05)
@@ -216,67 +220,70 @@ def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -
 def test_a_sure_correction_is_ignored_where_pictures_agree_and_smooth_where_nothing_is_visible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    missing = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
-    monkeypatch.setattr(correction, "predict", lambda weights, features: missing)
-    features, still = _described(mirrored=False, x=0, y=0), np.zeros((104, 88, 2), np.float32)
-    variance, near = np.exp(-5), np.ones((26, 22), np.float32)
-    flow, deviation = correction.correct(features, still, near)
+    prediction = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
+    monkeypatch.setattr(correction, "predict", lambda weights, features: prediction)
+    features, zero_flow = _describe(mirrored=False, x=0, y=0), np.zeros((104, 88, 2), np.float32)
+    variance, nearness = np.exp(-5), np.ones((26, 22), np.float32)
+    flow, deviation = correction.correct(features, zero_flow, nearness)
     assert np.abs(flow).max() < 0.02
     np.testing.assert_allclose(deviation, np.sqrt(0.5**2 + variance), rtol=0.02)  # either may be wrong
-    known = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
-    blank = features.copy()
-    blank[known] = 0  # no contrast: the pictures say nothing
-    missing[:, 10:14, 9:13] = [[[9.0]], [[-9.0]], [[-5]], [[-5]]]
+    known_channels = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
+    blank_features = features.copy()
+    blank_features[known_channels] = 0  # no contrast: the pictures say nothing
+    prediction[:, 10:14, 9:13] = [[[9.0]], [[-9.0]], [[-5]], [[-5]]]
     for x, _ in correction.VECTORS[:-1]:
-        blank[x : x + 2] = missing[:2, :26, :22]  # but don't object
-    shown, _ = correction.correct(blank, still, near)
+        blank_features[x : x + 2] = prediction[:2, :26, :22]  # but don't object
+    blank_flow, _ = correction.correct(blank_features, zero_flow, nearness)
     share = 0.25 / (0.25 + variance)
-    np.testing.assert_allclose(shown[:24, :24], 0.5 * share**2, rtol=1e-3)
-    assert np.abs(shown[48:50, 44:46]).min() > 5
-    blank[correction.FEATURES.index("visible in both"), 8:16, 7:15] = 0
-    hidden, hidden_deviation = correction.correct(blank, still, near)
-    np.testing.assert_allclose(hidden[20:80, 20:70], 0.5 * share**2, rtol=1e-3)
+    np.testing.assert_allclose(blank_flow[:24, :24], 0.5 * share**2, rtol=1e-3)
+    assert np.abs(blank_flow[48:50, 44:46]).min() > 5
+    blank_features[correction.FEATURES.index("visible in both"), 8:16, 7:15] = 0
+    hidden_flow, hidden_deviation = correction.correct(blank_features, zero_flow, nearness)
+    np.testing.assert_allclose(hidden_flow[20:80, 20:70], 0.5 * share**2, rtol=1e-3)
     assert hidden_deviation[48, 44] > 5  # what the network says there is withheld
 
 
 def test_a_correction_is_confined_to_what_has_appeared_and_not_opposed_to_the_pictures(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    missing = np.repeat(np.float32([0.5, -0.3, -5, -5]), 32 * 24).reshape(4, 32, 24)
-    monkeypatch.setattr(correction, "predict", lambda weights, features: missing)
-    features, still = _described(mirrored=False), np.zeros((104, 88, 2), np.float32)  # moved (0.4, -0.25)
-    known = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
-    features[known] = 0  # the pictures don't hold it back, but point there
-    near = np.zeros((26, 22), np.float32)
-    near[:, :11] = 1
-    flow, deviation = correction.correct(features, still, near)
+    prediction = np.repeat(np.float32([0.5, -0.3, -5, -5]), 32 * 24).reshape(4, 32, 24)
+    monkeypatch.setattr(correction, "predict", lambda weights, features: prediction)
+    features, zero_flow = _describe(mirrored=False), np.zeros((104, 88, 2), np.float32)  # moved (0.4, -0.25)
+    known_channels = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
+    features[known_channels] = 0  # the pictures don't hold it back, but point there
+    nearness = np.zeros((26, 22), np.float32)
+    nearness[:, :11] = 1
+    flow, deviation = correction.correct(features, zero_flow, nearness)
     assert flow[20:-20, 12:36, 0].min() > 0.4
     assert np.abs(flow[:, 50:]).max() == 0
     assert deviation[52, 70] > 0.4  # what is withheld is not known
-    missing[:2] *= -1
-    flow, _ = correction.correct(features, still, near)
+    prediction[:2] *= -1
+    flow, _ = correction.correct(features, zero_flow, nearness)
     assert np.abs(flow[20:-20, 12:36]).max() < 0.1
 
 
 def test_what_has_appeared_is_an_object_that_was_not_masked_at_rest() -> None:
     shape, y, x = (240, 320), *np.mgrid[:240, :320]
-    every, rod = np.ones(shape, bool), (np.abs(x - 40) < 8) & (y < 100)
-    near = correction.nearness(every, ~rod)
-    assert near.shape == (60, 80)
-    assert near[:30, 9:11].min() == 1
-    assert near[:, 55:].max() == 0
-    assert near[10, 38] == pytest.approx(0.69, abs=0.06)  # 107 px away, 0.33 widths of 0.25 to 0.5
+    full_mask, rod = np.ones(shape, bool), (np.abs(x - 40) < 8) & (y < 100)
+    nearness = correction.nearness(full_mask, ~rod)
+    assert nearness.shape == (60, 80)
+    assert nearness[:30, 9:11].min() == 1
+    assert nearness[:, 55:].max() == 0
+    assert nearness[10, 38] == pytest.approx(0.69, abs=0.06)  # 107 px away, 0.33 widths of 0.25 to 0.5
     assert not correction.nearness(~rod, ~rod).any()
     assert not correction.nearness(~rod, ~np.roll(rod, 4, 1)).any()  # a highlight's rim that moves
-    assert not correction.nearness(every, np.hypot(x - 100, y - 100) > 4).any()  # a small highlight
-    assert not correction.nearness(every, every).any()
-    assert correction.nearness(every[:1, :1], every[:1, :1]).shape == (1, 1)
+    assert not correction.nearness(full_mask, np.hypot(x - 100, y - 100) > 4).any()  # a small highlight
+    assert not correction.nearness(full_mask, full_mask).any()
+    assert correction.nearness(full_mask[:1, :1], full_mask[:1, :1]).shape == (1, 1)
 
 
 def test_without_an_instrument_the_flow_is_the_solvers() -> None:
     pair = next(pairs(CLEAN, 1, 24))
-    every = np.ones(pair.rest.shape[:2], bool)
-    flows = [Tvl1(corrected=on).flow(pair.rest, pair.now, every, every)[0] for on in (False, True)]
+    full_mask = np.ones(pair.rest.shape[:2], bool)
+    flows = [
+        Tvl1(corrected=corrected).flow(pair.rest, pair.now, full_mask, full_mask)[0]
+        for corrected in (False, True)
+    ]
     np.testing.assert_array_equal(*flows)
 
 
@@ -284,7 +291,7 @@ def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None
     errors = []
     for pair in pairs(Recipe(), 3, 23):
         pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable
-        flows = [Tvl1(corrected=on).flow(*pictures)[0] for on in (False, True)]
-        errors.append([_error(flow, pair.flow)[pair.inside & ~pair.hidden].mean() for flow in flows])
-    before, after = np.mean(errors, axis=0)
-    assert after < before
+        flows = [Tvl1(corrected=corrected).flow(*pictures)[0] for corrected in (False, True)]
+        errors.append([_measure_error(flow, pair.flow)[pair.inside & ~pair.hidden].mean() for flow in flows])
+    error_before, error_after = np.mean(errors, axis=0)
+    assert error_after < error_before

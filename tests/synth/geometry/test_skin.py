@@ -38,8 +38,8 @@ def test_of_one_cell_is_closed_and_turned_outwards(
 
 def test_faces_between_cells_are_inside() -> None:
     points = np.array([[x, y, z] for z in range(4) for y in range(4) for x in range(4)], float)
-    first = np.array([x + 4 * y + 16 * z for z in range(3) for y in range(3) for x in range(3)])
-    nodes = first[:, None] + np.array([0, 1, 5, 4, 16, 17, 21, 20])
+    corner_nodes = np.array([x + 4 * y + 16 * z for z in range(3) for y in range(3) for x in range(3)])
+    nodes = corner_nodes[:, None] + np.array([0, 1, 5, 4, 16, 17, 21, 20])
     faces = skin(points, {12: nodes, 3: nodes[:, :2]})
     assert len(faces) == 2 * 6 * 9
     assert trimesh.Trimesh(points, faces, process=False).volume == pytest.approx(27)

@@ -27,9 +27,9 @@ anatomy:
 
 
 def test_every_error_is_reported_with_line_and_column() -> None:
-    with pytest.raises(UserError) as caught:
+    with pytest.raises(UserError) as error:
         reader.parse_job(BAD, "job.yaml", Path())
-    places = [": ".join(line.split(": ")[:2]) for line in str(caught.value).splitlines()]
+    places = [": ".join(line.split(": ")[:2]) for line in str(error.value).splitlines()]
     assert [place.removeprefix("job.yaml:") for place in places] == [
         "1:1: seed",
         "2:1: frames",
@@ -53,16 +53,16 @@ def test_overrides_take_precedence_and_are_named_if_wrong() -> None:
     overrides = ["render.spp=8", "render.size=[64, 48]", "fem.load=0.1"]
     job = reader.parse_job("render: {spp: 2}", "job.yaml", Path(), overrides)
     assert (job.render.spp, job.render.size, job.fem.load) == (8, (64, 48), (0.1, 0.1))
-    for wrong in ("render.spp=0", "rendr.spp=1", "render.spp", "frames=2"):
-        with pytest.raises(UserError, match=wrong):
-            reader.parse_job("seed: 1", "job.yaml", Path(), [wrong])
+    for override in ("render.spp=0", "rendr.spp=1", "render.spp", "frames=2"):
+        with pytest.raises(UserError, match=override):
+            reader.parse_job("seed: 1", "job.yaml", Path(), [override])
 
 
 def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
-    timed = {"timing": ["0.1 s", "0.2 s", "0.3 s", "0.4 s"]}
-    fem = {"load": 0.05, "instrument": "spatula", "instrument_list": [timed]}
+    tool = {"timing": ["0.1 s", "0.2 s", "0.3 s", "0.4 s"]}
+    fem = {"load": 0.05, "instrument": "spatula", "instrument_list": [tool]}
     job = Job(seed=3, fem=fem, appearance={"families": ["pale", "calf"]})
-    assert reader.parse_job(job_writer.commented(job), "job.yaml", Path()) == job
+    assert reader.parse_job(job_writer.document_job(job), "job.yaml", Path()) == job
     assert reader.parse_job(job_writer.dump_job(job), "job.yaml", Path()) == job
 
 

@@ -54,26 +54,26 @@ def test_a_photograph_is_the_albedo(brain: CortexSurface, tmp_path: Path) -> Non
 def test_the_spot_moves_with_the_microscope_and_is_the_same_for_both_cameras() -> None:
     render = RenderSection(stereo_mm=24.0)
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), read_lens(render))
-    drawn = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
+    illumination = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
     right = camera.right_camera(lens, 24.0)
     field = lens.size[0] * lens.mm_per_px
     axis = lens.centre / np.linalg.norm(lens.centre)
-    across = lens.rotation[0]
-    middle = 1.25  # brightest of a spot smaller than the opening
+    image_axis = lens.rotation[0]
+    peak = 1.25  # brightest of a spot smaller than the opening
     for radius, share in ((0.0, 1.0), (0.3, 2 / 3), (0.45, 1 / (1 + 0.5 * 1.5**4))):
-        point = radius * field * across
+        point = radius * field * image_axis
         assert abs(point @ axis) < 1e-9
-        for one in (lens, right):
-            x, y = np.rint(camera.project(one, point[None])[0]).astype(int)
-            found = light.spot(one, lens, drawn.even)
-            assert found.shape == (lens.size[1], lens.size[0])
-            assert found[y, x] == pytest.approx(middle * share, abs=0.01)
+        for view in (lens, right):
+            x, y = np.rint(camera.project(view, point[None])[0]).astype(int)
+            spot = light.spot(view, lens, illumination.even)
+            assert spot.shape == (lens.size[1], lens.size[0])
+            assert spot[y, x] == pytest.approx(peak * share, abs=0.01)
 
 
 def test_a_spot_of_any_usual_size_leaves_the_opening_its_mean_light() -> None:
     render = RenderSection()
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), read_lens(render))
     rows, columns = np.mgrid[: lens.size[1], : lens.size[0]]
-    away = np.hypot(columns - lens.K[0, 2], rows - lens.K[1, 2]) / lens.size[0]
+    distance = np.hypot(columns - lens.K[0, 2], rows - lens.K[1, 2]) / lens.size[0]
     for even in (0.35, 0.5, np.inf):
-        assert light.spot(lens, lens, even)[away < 0.37].mean() == pytest.approx(1, abs=0.01)
+        assert light.spot(lens, lens, even)[distance < 0.37].mean() == pytest.approx(1, abs=0.01)

@@ -17,27 +17,27 @@ RENDER = RenderSection(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4))
 LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), read_lens(RENDER))
 
 
-def distorted(distortion: tuple[float, ...]) -> camera.Camera:
+def place_distorted(distortion: tuple[float, ...]) -> camera.Camera:
     render = RenderSection(size=(160, 120), distortion=distortion, field_mm=(150.0, 150.0))
     return camera.place(scenario.draw_view(render, np.random.default_rng(3)), read_lens(render))
 
 
 def assert_projects_as_opencv(lens: camera.Camera, points: np.ndarray) -> None:
     rotation, _ = cv2.Rodrigues(lens.rotation)
-    theirs, _ = cv2.projectPoints(points, rotation, lens.translation, lens.K, lens.distortion)
-    np.testing.assert_allclose(camera.project(lens, points), theirs[:, 0], atol=1e-9)
+    expected, _ = cv2.projectPoints(points, rotation, lens.translation, lens.K, lens.distortion)
+    np.testing.assert_allclose(camera.project(lens, points), expected[:, 0], atol=1e-9)
 
 
 def test_projection_is_opencvs() -> None:
-    assert_projects_as_opencv(distorted(STRONG), np.random.default_rng(0).uniform(-40, 40, (500, 3)))
+    assert_projects_as_opencv(place_distorted(STRONG), np.random.default_rng(0).uniform(-40, 40, (500, 3)))
 
 
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, (-0.05, 0.01, 0.0, 0.0, 0.0), STRONG])
 def test_a_ray_comes_back_to_its_pixel(distortion: tuple[float, ...]) -> None:
-    lens = distorted(distortion)
+    lens = place_distorted(distortion)
     pixels = camera.pixel_grid(lens.size)
-    there = lens.centre + 280 * camera.rays(lens, pixels) @ lens.rotation
-    np.testing.assert_allclose(camera.project(lens, there), pixels, atol=1e-8)
+    points = lens.centre + 280 * camera.rays(lens, pixels) @ lens.rotation
+    np.testing.assert_allclose(camera.project(lens, points), pixels, atol=1e-8)
 
 
 def test_it_looks_at_the_craniotomy_from_its_distance_and_tilt() -> None:
@@ -56,7 +56,7 @@ def test_it_looks_at_the_craniotomy_from_its_distance_and_tilt() -> None:
 
 def test_a_distortion_that_folds_the_picture_is_refused() -> None:
     with pytest.raises(UserError):
-        camera.rays(distorted((-9.0, 0.0, 0.0, 0.0, 0.0)), camera.pixel_grid((160, 120)))
+        camera.rays(place_distorted((-9.0, 0.0, 0.0, 0.0, 0.0)), camera.pixel_grid((160, 120)))
 
 
 def test_drift_starts_at_rest_and_has_the_given_size() -> None:
@@ -69,8 +69,8 @@ def test_drift_starts_at_rest_and_has_the_given_size() -> None:
 def test_the_right_camera_has_the_disparity_of_a_rectified_pair() -> None:
     right = camera.right_camera(LENS, 20.0)
     points = np.random.default_rng(0).uniform(-8, 8, (30, 3))
-    plain = replace(LENS, distortion=np.zeros(5)), replace(right, distortion=np.zeros(5))
-    left_px, right_px = (camera.project(lens, points) for lens in plain)
+    cameras = replace(LENS, distortion=np.zeros(5)), replace(right, distortion=np.zeros(5))
+    left_px, right_px = (camera.project(lens, points) for lens in cameras)
     depth = camera.to_camera(LENS, points)[:, 2]
     disparity = left_px[:, 0] - right_px[:, 0]
     distance = LENS.translation[2]
@@ -86,5 +86,5 @@ def test_blur_is_the_spread_of_rays_through_the_lens() -> None:
     assert radius[1] < 1e-6
     # A ray from the lens's edge through the point in focus, met again 3 mm behind it.
     focus = LENS.focus_mm
-    miss = LENS.aperture_mm * 3.0 / focus
-    assert np.isclose(radius[2], LENS.K[0, 0] * miss / (focus + 3.0))
+    offset_mm = LENS.aperture_mm * 3.0 / focus
+    assert np.isclose(radius[2], LENS.K[0, 0] * offset_mm / (focus + 3.0))

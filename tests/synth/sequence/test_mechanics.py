@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import own_mechanics
 import pytest
-from egg_brain import soup, written
+from egg_brain import soup, write_triangles
 from own_mechanics import DENT_MM, DEPTH_MM, WIDTH_MM, Springs
 
 import synth
@@ -27,7 +27,7 @@ SMALL = {"sequences": 1, "frames": 4, "fem": {"tets": 400}, "render": {"size": (
 
 @pytest.fixture(scope="module")
 def egg(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("brain") / "egg.obj", soup())
+    return write_triangles(tmp_path_factory.mktemp("brain") / "egg.obj", soup())
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +36,19 @@ def job(egg: Path) -> synth.Job:
     return synth.Job.model_validate({"seed": 4, **SMALL, "anatomy": anatomy})
 
 
-def bare(job: synth.Job, pulse: Pulse | None = None) -> synth.Scenario:
+def draw_bare_scenario(job: synth.Job, pulse: Pulse | None = None) -> synth.Scenario:
     """The drawn scenario without instruments."""
     return replace(synth.draw_scenario(job, 0), gestures=(), pulse=pulse)
 
 
 def test_a_placed_brain_is_mapped_back_to_the_coordinates_of_its_file(egg: Path) -> None:
     brain = load_brain(egg, Craniotomy(**TILTED))
-    back = np.linalg.inv(brain.to_world)
-    found = brain.shape.vertices @ back[:3, :3].T + back[:3, 3]
-    assert np.abs(found - read_brain(egg)[0]).max() < 1e-9
-    np.testing.assert_allclose(back[:3, :3] @ brain.to_world[:3, :3], np.eye(3), atol=1e-12)
-    turned = brain.to_world[:3, :3] @ (np.array(TILTED["direction"]) / np.linalg.norm(TILTED["direction"]))
-    np.testing.assert_allclose(turned, [0, 0, 1], atol=1e-12)
+    from_world = np.linalg.inv(brain.to_world)
+    vertices = brain.shape.vertices @ from_world[:3, :3].T + from_world[:3, 3]
+    assert np.abs(vertices - read_brain(egg)[0]).max() < 1e-9
+    np.testing.assert_allclose(from_world[:3, :3] @ brain.to_world[:3, :3], np.eye(3), atol=1e-12)
+    axis = brain.to_world[:3, :3] @ (np.array(TILTED["direction"]) / np.linalg.norm(TILTED["direction"]))
+    np.testing.assert_allclose(axis, [0, 0, 1], atol=1e-12)
 
 
 @pytest.mark.slow
@@ -62,36 +62,36 @@ def test_springs_on_a_users_brain_are_sealed_verified_and_mapped_back(job: synth
     assert sequence.attrs["mechanics"]["instruments"] == []
     assert not sequence["tool"][:].any()
     # All springs together: E / depth times the dent's volume over a flat surface, 2 pi width^2 dent.
-    pressed = sequence["force"][:] / sequence.attrs["young_kpa"] * DEPTH_MM / (2 * np.pi * WIDTH_MM**2)
-    assert np.linalg.norm(pressed, axis=1).max() == pytest.approx(0.75 * DENT_MM, rel=0.1)
+    dents_mm = sequence["force"][:] / sequence.attrs["young_kpa"] * DEPTH_MM / (2 * np.pi * WIDTH_MM**2)
+    assert np.linalg.norm(dents_mm, axis=1).max() == pytest.approx(0.75 * DENT_MM, rel=0.1)
     # Depth of the rest frame in the coordinates of the file: points of the ellipsoid but for its triangles.
     view, tissue, depth = optics.camera_of(sequence), sequence["tissue"][:], sequence["depth"][0]
     points = cameras.rays(view, cameras.pixel_grid(view.size)) * depth.reshape(-1, 1)
     world = (points[tissue.ravel()] - view.translation) @ view.rotation
-    back = np.linalg.inv(sequence.attrs["mesh_to_world"])
-    places = (world @ back[:3, :3].T + back[:3, 3]) / [32.0, 26.0, 22.0]
-    assert np.abs(np.linalg.norm(places, axis=1) - 1).max() < 0.04
+    from_world = np.linalg.inv(sequence.attrs["mesh_to_world"])
+    positions = (world @ from_world[:3, :3].T + from_world[:3, 3]) / [32.0, 26.0, 22.0]
+    assert np.abs(np.linalg.norm(positions, axis=1) - 1).max() < 0.04
 
 
 def test_a_pulse_alone_moves_the_surface_without_force(job: synth.Job) -> None:
     pulse = Pulse(0.3, 1.2, 0.2, 0.5, 0.3, 1.0)
-    scene = synth.simulate(job, case=bare(job, pulse))
-    middle = np.hypot(*scene.shape.vertices[:, :2].T) < 2.5
-    rise = scene.motion.displacement[:, middle, 2].mean(axis=1)
+    scene = synth.simulate(job, case=draw_bare_scenario(job, pulse))
+    centre = np.hypot(*scene.shape.vertices[:, :2].T) < 2.5
+    rise = scene.motion.displacement[:, centre, 2].mean(axis=1)
     assert rise == pytest.approx(pulse.height(scene.time), rel=0.1, abs=0.01)
     assert not scene.motion.traction.any()
     assert scene.motion.tip.shape == (4, 0, 3)
-    still = synth.simulate(job, case=bare(job)).motion
-    assert not still.displacement.any()
+    rest_motion = synth.simulate(job, case=draw_bare_scenario(job)).motion
+    assert not rest_motion.displacement.any()
 
 
 WRONG: dict[str, Callable[[synth.Deformation], Any]] = {
-    "displacement": lambda found: found.displacement[:, :-1],
-    "traction": lambda found: 1e-3 * found.traction,  # MPa
-    "force": lambda found: found.force[1:],
-    "tip": lambda found: np.zeros((4, 2, 3)),
-    "energy": lambda found: np.full(4, np.nan),
-    "residual": lambda found: [0.0] * 4,
+    "displacement": lambda deformation: deformation.displacement[:, :-1],
+    "traction": lambda deformation: 1e-3 * deformation.traction,  # MPa
+    "force": lambda deformation: deformation.force[1:],
+    "tip": lambda deformation: np.zeros((4, 2, 3)),
+    "energy": lambda deformation: np.full(4, np.nan),
+    "residual": lambda deformation: [0.0] * 4,
 }
 
 
@@ -99,15 +99,15 @@ WRONG: dict[str, Callable[[synth.Deformation], Any]] = {
 def test_an_invalid_result_is_refused_by_name(job: synth.Job, name: str) -> None:
     class Wrong(Springs):
         def deform(self, rest: synth.RestScene, *_: object) -> synth.Deformation:
-            found = super().deform(rest)
+            deformation = super().deform(rest)
             if name == "rest":
-                return replace(found, displacement=found.displacement + 0.01)
+                return replace(deformation, displacement=deformation.displacement + 0.01)
             if name == "single":
-                return replace(found, displacement=found.displacement.astype(np.float32))
-            return replace(found, **{name: WRONG[name](found)})
+                return replace(deformation, displacement=deformation.displacement.astype(np.float32))
+            return replace(deformation, **{name: WRONG[name](deformation)})
 
     with pytest.raises(synth.UserError, match=name if name in WRONG else "displacement"):
-        synth.simulate(job, case=bare(job), mechanics=Wrong())
+        synth.simulate(job, case=draw_bare_scenario(job), mechanics=Wrong())
 
 
 def test_as_many_instruments_as_gestures_are_expected(job: synth.Job) -> None:
@@ -117,12 +117,12 @@ def test_as_many_instruments_as_gestures_are_expected(job: synth.Job) -> None:
 
 @pytest.mark.slow
 def test_content_of_ones_own_is_drawn_around_the_same_surface(job: synth.Job) -> None:
-    def without_instruments(rest: RestScene) -> synth.SceneContent:
+    def remove_instruments(rest: RestScene) -> synth.SceneContent:
         return replace(draw_craniotomy(rest), instruments=None)
 
-    ours = synth.simulate(job)
-    other = synth.simulate(job, content=without_instruments)
-    one, two = ours.frame(2), other.frame(2)
-    assert one.tool.any()
-    assert not two.tool.any()
-    np.testing.assert_array_equal(one.flow, two.flow)
+    scene = synth.simulate(job)
+    bare_scene = synth.simulate(job, content=remove_instruments)
+    frame, bare_frame = scene.frame(2), bare_scene.frame(2)
+    assert frame.tool.any()
+    assert not bare_frame.tool.any()
+    np.testing.assert_array_equal(frame.flow, bare_frame.flow)

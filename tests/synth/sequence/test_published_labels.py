@@ -15,17 +15,17 @@ TISSUE = np.ones(SIZE, bool)
 TISSUE[:, :5] = False
 
 
-def scene() -> tuple[np.ndarray, np.ndarray]:
+def make_scene() -> tuple[np.ndarray, np.ndarray]:
     """A smooth flow and a round load on it."""
     rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
-    away = np.hypot(rows - 20, columns - 30) / 6
-    load = np.clip(1 - away**2, 0, None)[..., None] ** 2 * (0.0, 3.0, 4.0)
-    flow = np.exp(-(away[..., None] ** 2) / 8) * (4.0, -2.0) * TISSUE[..., None]
+    distance = np.hypot(rows - 20, columns - 30) / 6
+    load = np.clip(1 - distance**2, 0, None)[..., None] ** 2 * (0.0, 3.0, 4.0)
+    flow = np.exp(-(distance[..., None] ** 2) / 8) * (4.0, -2.0) * TISSUE[..., None]
     return flow.astype(np.float32), load
 
 
 def test_intensity_peaks_at_the_total_force_and_keeps_direction() -> None:
-    _, load = scene()
+    _, load = make_scene()
     label = published_labels.intensity(load, 70.0)
     assert np.linalg.norm(label, axis=-1).max() == pytest.approx(70.0)
     np.testing.assert_allclose(label * 5.0, load * 70.0, atol=1e-9)
@@ -38,31 +38,31 @@ def test_first_stage_has_the_given_deviation() -> None:
     noisy = published_labels.add_noise(label, TISSUE, 0.02, np.random.default_rng(0))
     assert not noisy[~TISSUE].any()
     assert (noisy - label)[TISSUE].std() == pytest.approx(1.0, rel=0.05)
-    still = published_labels.add_noise(label, TISSUE, 0.0, np.random.default_rng(0))
-    np.testing.assert_array_equal(still[TISSUE], label[TISSUE])
+    noiseless = published_labels.add_noise(label, TISSUE, 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(noiseless[TISSUE], label[TISSUE])
 
 
 def test_second_stage_disturbs_the_given_share_away_from_the_contact() -> None:
-    flow, load = scene()
+    flow, load = make_scene()
     label = np.linalg.norm(published_labels.intensity(load, 70.0), axis=-1)
-    noisy, left = published_labels.disturb(flow, label, TISSUE, np.random.default_rng(0))
-    moved = (noisy != flow).any(axis=-1)
-    assert moved.sum() == pytest.approx(0.05 * TISSUE.sum(), abs=1)
-    assert not moved[~TISSUE].any()
-    assert not left[moved].any()
-    np.testing.assert_array_equal(left[~moved], label[~moved])
+    noisy, kept_label = published_labels.disturb(flow, label, TISSUE, np.random.default_rng(0))
+    disturbed = (noisy != flow).any(axis=-1)
+    assert disturbed.sum() == pytest.approx(0.05 * TISSUE.sum(), abs=1)
+    assert not disturbed[~TISSUE].any()
+    assert not kept_label[disturbed].any()
+    np.testing.assert_array_equal(kept_label[~disturbed], label[~disturbed])
     span = np.ptp(flow[TISSUE], axis=0)
     assert (np.abs(noisy - flow).reshape(-1, 2).max(axis=0) <= 0.05 * span).all()
     assert (np.abs(noisy - flow).reshape(-1, 2).max(axis=0) >= 0.03 * span).all()
-    pressed = np.argwhere(label > np.percentile(label[TISSUE], 90))
-    reach = 1.5 * np.linalg.norm(pressed - pressed.mean(axis=0), axis=1).max()
-    assert np.linalg.norm(np.argwhere(moved) - pressed.mean(axis=0), axis=1).min() > reach
+    pressed_pixels = np.argwhere(label > np.percentile(label[TISSUE], 90))
+    reach = 1.5 * np.linalg.norm(pressed_pixels - pressed_pixels.mean(axis=0), axis=1).max()
+    assert np.linalg.norm(np.argwhere(disturbed) - pressed_pixels.mean(axis=0), axis=1).min() > reach
 
 
 @pytest.mark.slow
 def test_the_papers_dataset_holds_noisy_labels_next_to_the_truth(tmp_path: Path) -> None:
-    small = ["frames=12", "anatomy.vertices=2500", "fem.tets=600", "render.size=[96,72]", "render.spp=1"]
-    job = reader.load_job("paper", [*small, "flow.backend=dis"])
+    settings = ["frames=12", "anatomy.vertices=2500", "fem.tets=600", "render.size=[96,72]", "render.spp=1"]
+    job = reader.load_job("paper", [*settings, "flow.backend=dis"])
     sequence = open_sequence(render_sequence(job, 0, tmp_path, lambda *_: None))
     flow, noisy, label = sequence["flow"][:], sequence["flow_noisy"][:], sequence["intensity"][:]
     force = np.linalg.norm(sequence["force"][:], axis=1)
@@ -71,7 +71,8 @@ def test_the_papers_dataset_holds_noisy_labels_next_to_the_truth(tmp_path: Path)
     assert not disturbed[0].any()
     assert not label[disturbed].any()
     assert (disturbed.sum(axis=(1, 2)) <= 0.05 * sequence["tissue"][:].sum()).all()
-    loaded = force > 0.05 * force.max()
+    loaded_frames = force > 0.05 * force.max()
     peaks = label.max(axis=(1, 2))
-    np.testing.assert_allclose(peaks[loaded], force[loaded], rtol=0.15)
-    assert not np.allclose(peaks[loaded], force[loaded], rtol=1e-4)  # the first stage is there as well
+    np.testing.assert_allclose(peaks[loaded_frames], force[loaded_frames], rtol=0.15)
+    # The first stage is there as well.
+    assert not np.allclose(peaks[loaded_frames], force[loaded_frames], rtol=1e-4)

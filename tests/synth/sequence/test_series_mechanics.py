@@ -34,9 +34,9 @@ TISSUE = [f"fem.young_kpa={YOUNG_KPA}", f"fem.poisson={POISSON}", "mechanics.uni
 FORCE = [*TISSUE, "mechanics.force=nodal:contact"]
 
 
-def job_of(source: Path, *more: str) -> Job:
+def make_job(source: Path, *changes: str) -> Job:
     files = [f"mechanics.source={source}", "mechanics.unit_mm=1", f"mechanics.dt_s={STEP_S}", PLACE]
-    return synth.load_job("tiny", ["fem.load=[0.05,0.4]", "fem.tets=1600", *SMALL, *files, *more])
+    return synth.load_job("tiny", ["fem.load=[0.05,0.4]", "fem.tets=1600", *SMALL, *files, *changes])
 
 
 @pytest.fixture(scope="module")
@@ -47,59 +47,69 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp_path: Path) -> None:
     """One state per frame; then at twice the rate; the exported surface, rendered again, is the same."""
-    in_process(job_of(source, *FORCE), tmp_path / "a", render_sequence)
-    found = verify_dataset(tmp_path / "a")
-    assert found.good, found.lines()
+    in_process(make_job(source, *FORCE), tmp_path / "a", render_sequence)
+    report = verify_dataset(tmp_path / "a")
+    assert report.good, report.lines()
     sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
-    turn, true = np.array(sequence.attrs["rotation"]), -solve().scale[:, None] * solve().reaction
-    np.testing.assert_allclose(sequence["force"][:], true @ turn.T, rtol=1e-4, atol=1e-4)
-    assert {one.name: one.count for one in found.checks}["compliance"] == 1
+    turn, expected = np.array(sequence.attrs["rotation"]), -solve().scale[:, None] * solve().reaction
+    np.testing.assert_allclose(sequence["force"][:], expected @ turn.T, rtol=1e-4, atol=1e-4)
+    assert {check.name: check.count for check in report.checks}["compliance"] == 1
     assert sequence.attrs["mechanics"]["law"] == "external"
     run(app, "export", tmp_path / "a", tmp_path / "vtu", "--to", "vtu")
-    again = job_of(tmp_path / "vtu" / "000000.pvd", *FORCE, "mechanics.force=nodal:force")
-    second = synth.simulate(again, 0)
-    np.testing.assert_allclose(second.force, sequence["force"][:], rtol=1e-3, atol=1e-3)
+    second_job = make_job(tmp_path / "vtu" / "000000.pvd", *FORCE, "mechanics.force=nodal:force")
+    second_scene = synth.simulate(second_job, 0)
+    np.testing.assert_allclose(second_scene.force, sequence["force"][:], rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.slow
 def test_flow_is_the_projection_of_the_engines_nodes(source: Path) -> None:
     """Of a fine mesh, between whose nodes motion is smooth; without veins, which would stand out of it."""
-    fine = ["anatomy.vertices=90000", "render.size=[240,180]", "flow.backend=ideal"]
+    settings = ["anatomy.vertices=90000", "render.size=[240,180]", "flow.backend=ideal"]
     folder = write(source.parent / "fine", "npz", spacing_mm=1.5)
-    scene = synth.simulate(job_of(folder, *FORCE, *fine), 0, content=draw_craniotomy)
+    scene = synth.simulate(make_job(folder, *FORCE, *settings), 0, content=draw_craniotomy)
     block, t, frame = solve(1.5), 2, scene.frame(2)
     top = np.isclose(block.points[:, 2], 0) & (np.hypot(*block.points[:, :2].T) < 8)
     assert scene.brain is not None
     turn, shift = scene.brain.to_world[:3, :3], scene.brain.to_world[:3, 3]
-    rest, moved = (at[top] @ turn.T + shift for at in (block.points, block.points + block.scale[t] * block.u))
+    rest, moved_points = (
+        nodes[top] @ turn.T + shift for nodes in (block.points, block.points + block.scale[t] * block.u)
+    )
     start = camera.project(scene.view, rest)
-    true = camera.project(frame.camera, moved) - start
+    expected = camera.project(frame.camera, moved_points) - start
     inside = ndimage.map_coordinates(scene.tissue.astype(float), start.T[::-1], order=1) == 1
-    found = [ndimage.map_coordinates(frame.flow[..., d], start.T[::-1], np.float64, order=3) for d in (0, 1)]
-    off = np.linalg.norm(np.stack(found, axis=1) - true, axis=1)[inside]
+    flow = [ndimage.map_coordinates(frame.flow[..., d], start.T[::-1], np.float64, order=3) for d in (0, 1)]
+    error = np.linalg.norm(np.stack(flow, axis=1) - expected, axis=1)[inside]
     assert inside.sum() > 50
-    assert np.linalg.norm(true, axis=1).max() > 2
-    assert np.median(off) < 1.5e-3
-    assert off.max() < 1e-2
+    assert np.linalg.norm(expected, axis=1).max() > 2
+    assert np.median(error) < 1.5e-3
+    assert error.max() < 1e-2
 
 
 def test_frames_lie_between_states_and_other_axes_turn_the_result(source: Path, tmp_path: Path) -> None:
-    plain = synth.simulate(job_of(source, *FORCE), 0)
-    twice = synth.simulate(job_of(source, *FORCE, f"frames={2 * STATES - 1}", f"fps={2 / STEP_S}"), 0)
-    np.testing.assert_allclose(twice.motion.displacement[::2], plain.motion.displacement, atol=1e-9)
-    middle = (plain.force[1:] + plain.force[:-1]) / 2
-    np.testing.assert_allclose(twice.force[1::2], middle, rtol=1e-6, atol=1e-6)
-    with np.load(write(tmp_path, "npz")) as held:
-        arrays = {name: one[..., [1, 2, 0]] if one.shape[-1] == 3 else one for name, one in held.items()}
+    plain_scene = synth.simulate(make_job(source, *FORCE), 0)
+    double_scene = synth.simulate(
+        make_job(source, *FORCE, f"frames={2 * STATES - 1}", f"fps={2 / STEP_S}"), 0
+    )
+    np.testing.assert_allclose(
+        double_scene.motion.displacement[::2], plain_scene.motion.displacement, atol=1e-9
+    )
+    midpoints = (plain_scene.force[1:] + plain_scene.force[:-1]) / 2
+    np.testing.assert_allclose(double_scene.force[1::2], midpoints, rtol=1e-6, atol=1e-6)
+    with np.load(write(tmp_path, "npz")) as file:
+        arrays = {
+            name: values[..., [1, 2, 0]] if values.shape[-1] == 3 else values for name, values in file.items()
+        }
     np.savez(tmp_path / "turned.npz", **arrays)
     place = "anatomy.craniotomy={point: [0, 0, 0], direction: [0, 1, 0], radius_mm: 10}"
-    turned = synth.simulate(job_of(tmp_path / "turned.npz", *FORCE, place), 0)
-    sizes = [np.linalg.norm(one, axis=-1) for one in (turned.force, plain.force)]
+    turned_scene = synth.simulate(make_job(tmp_path / "turned.npz", *FORCE, place), 0)
+    sizes = [np.linalg.norm(force, axis=-1) for force in (turned_scene.force, plain_scene.force)]
     np.testing.assert_allclose(*sizes, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(turned.motion.force[:, 2], plain.motion.force[:, 2], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        turned_scene.motion.force[:, 2], plain_scene.motion.force[:, 2], rtol=1e-5, atol=1e-5
+    )
 
 
-def table(source: Path, name: str, tip: Floats) -> None:
+def write_table(source: Path, name: str, tip: Floats) -> None:
     rows = [f"{STEP_S * k},{x},{y},{z},0,0,2" for k, (x, y, z) in enumerate(tip.tolist())]
     (source.parent / name).write_text("time,x0,y0,z0,u0,v0,w0\n" + "\n".join(rows) + "\n")
 
@@ -108,9 +118,9 @@ def table(source: Path, name: str, tip: Floats) -> None:
 def test_instruments_follow_their_table(source: Path) -> None:
     """The tip is where the load is, by the check of contacts in pixels; it hides the tissue under it."""
     tip = np.array([1.0, 0.0, 0.0]) + np.outer(solve().scale, [0.3, 0, -1.0])
-    table(source, "tips.csv", tip)
+    write_table(source, "tips.csv", tip)
     scene = synth.simulate(
-        job_of(source, *FORCE, "mechanics.instruments=tips.csv", "fem.instrument=suction"), 0
+        make_job(source, *FORCE, "mechanics.instruments=tips.csv", "fem.instrument=suction"), 0
     )
     assert scene.brain is not None
     turn, shift = scene.brain.to_world[:3, :3], scene.brain.to_world[:3, 3]
@@ -122,7 +132,7 @@ def test_instruments_follow_their_table(source: Path) -> None:
 
 @pytest.mark.slow
 def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path) -> None:
-    job = job_of(source)
+    job = make_job(source)
     with synth.open_dataset(tmp_path / "a", job) as folder:
         synth.write_scene(synth.simulate(job, 0), folder)
     assert verify_dataset(tmp_path / "a").good
@@ -130,27 +140,27 @@ def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path
     assert not {"force", "traction"} & set(sequence.fields)
     assert sequence.attrs["young_kpa"] is None
     assert "peak_force_mn" not in sequence.attrs["summary"]
-    for form, works in (("folder", 0), ("video", 0), ("endonerf", 0), ("d2fnet-npz", 2)):
-        run(app, "export", tmp_path / "a", tmp_path / form, "--to", form, code=works)
-    assert np.isnan(synth.simulate(job_of(source), 0).force).all()
+    for form, code in (("folder", 0), ("video", 0), ("endonerf", 0), ("d2fnet-npz", 2)):
+        run(app, "export", tmp_path / "a", tmp_path / form, "--to", form, code=code)
+    assert np.isnan(synth.simulate(make_job(source), 0).force).all()
 
 
 @pytest.mark.slow
 def test_doubts_are_stored_and_counted_and_a_replaced_series_is_refused(tmp_path: Path) -> None:
     """Two nodes that change places are named by render and verify; then another motion takes their place."""
     source = write(tmp_path / "block", "npz")
-    with np.load(source) as held:
-        arrays = dict(held)
+    with np.load(source) as file:
+        arrays = dict(file)
     top = np.flatnonzero(np.isclose(arrays["rest"][:, 2], 0))
     order = top[np.linalg.norm(arrays["rest"][top], axis=1).argsort()][:2]
     places = (arrays["rest"] + arrays["displacement"][3])[order[::-1]]
     arrays["displacement"][3][order] = places - arrays["rest"][order]
     np.savez(source, **arrays)
-    job, root = job_of(source, *FORCE, "sequences=2"), tmp_path / "out"
-    made = synth.render_job(job.model_copy(update={"sequences": 1}), root, workers=1)
-    (doubt,) = (one for one in made.cautions if one.startswith("nodes"))
-    assert all(str(one) in doubt for one in [*order.tolist(), "state 3"])
-    assert made.cautions[doubt] == [0]
+    job, root = make_job(source, *FORCE, "sequences=2"), tmp_path / "out"
+    summary = synth.render_job(job.model_copy(update={"sequences": 1}), root, workers=1)
+    (doubt,) = (caution for caution in summary.cautions if caution.startswith("nodes"))
+    assert all(str(word) in doubt for word in [*order.tolist(), "state 3"])
+    assert summary.cautions[doubt] == [0]
     stored = synth.open_sequence(root / "000000.zarr").attrs["mechanics"]["cautions"]
     assert doubt in stored
     report = verify_dataset(root, fast=True)
@@ -167,27 +177,27 @@ def test_doubts_are_stored_and_counted_and_a_replaced_series_is_refused(tmp_path
 
 def test_a_pull_is_doubtful_unless_the_instrument_can(source: Path) -> None:
     """A press upside down is a pull; the direction of the opening tells."""
-    with np.load(write(source.parent / "pull", "npz")) as held:
-        arrays = dict(held)
+    with np.load(write(source.parent / "pull", "npz")) as file:
+        arrays = dict(file)
     arrays |= {name: -arrays[name] for name in ("displacement", "contact")}
     np.savez(source.parent / "pull/s.npz", **arrays)
-    job = job_of(source.parent / "pull/s.npz", *FORCE)
-    assert any("upside down" in one for one in read_job_series(job, 0).cautions)
-    table(source.parent / "pull/s.npz", "tips.csv", np.zeros((STATES, 3)))
-    given = ["mechanics.instruments=tips.csv", "fem.instrument=forceps"]
-    job = job_of(source.parent / "pull/s.npz", *FORCE, *given)
+    job = make_job(source.parent / "pull/s.npz", *FORCE)
+    assert any("upside down" in caution for caution in read_job_series(job, 0).cautions)
+    write_table(source.parent / "pull/s.npz", "tips.csv", np.zeros((STATES, 3)))
+    changes = ["mechanics.instruments=tips.csv", "fem.instrument=forceps"]
+    job = make_job(source.parent / "pull/s.npz", *FORCE, *changes)
     assert not read_job_series(job, 0).cautions
 
 
 def test_load_outside_the_opening_is_reported(source: Path) -> None:
     place = PLACE.replace("point: [0", "point: [10")
     with pytest.warns(Caution, match=r"force: .* mN, [3-7]\d%.* 0.00 mN"):
-        scene = synth.simulate(job_of(source, *FORCE, place), 0)
+        scene = synth.simulate(make_job(source, *FORCE, place), 0)
     np.testing.assert_allclose(scene.motion.force[2], -solve().reaction, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("more", "named"),
+    ("changes", "pattern"),
     [
         (["fem.membrane.probability=1"], "membrane"),
         (["fem.young_kpa=[1,2]"], "young_kpa"),
@@ -197,26 +207,26 @@ def test_load_outside_the_opening_is_reported(source: Path) -> None:
         (["mechanics.force=", "store.extra=[intensity]"], "intensity"),
     ],
 )
-def test_a_job_that_does_not_suit_is_refused(more: list[str], named: str, source: Path) -> None:
+def test_a_job_that_does_not_suit_is_refused(changes: list[str], pattern: str, source: Path) -> None:
     (source.parent / "brain.obj").touch()
-    with pytest.raises(UserError, match=named):
-        synth.simulate(job_of(source, *FORCE, *more), 0)
+    with pytest.raises(UserError, match=pattern):
+        synth.simulate(make_job(source, *FORCE, *changes), 0)
 
 
 def test_files_enter_the_identity_by_content_and_folders_take_turns(tmp_path: Path) -> None:
     for name in ("run_a", "run_b"):
         write(tmp_path / name, "ascii")
-    job = job_of(tmp_path / "run_*", *FORCE, "sequences=3")
-    assert [one.name for one in series_files.list_sources(tmp_path / "run_*")] == ["run_a", "run_b"]
-    before, file = identity.identify_job(job), tmp_path / "run_b" / "block_3.vtu"
+    job = make_job(tmp_path / "run_*", *FORCE, "sequences=3")
+    assert [path.name for path in series_files.list_sources(tmp_path / "run_*")] == ["run_a", "run_b"]
+    old_identity, file = identity.identify_job(job), tmp_path / "run_b" / "block_3.vtu"
     (tmp_path / "elsewhere").mkdir()
     for name in ("run_a", "run_b"):
         (tmp_path / name).rename(tmp_path / "elsewhere" / name)
-    moved = job_of(tmp_path / "elsewhere" / "run_*", *FORCE, "sequences=3")
-    assert identity.identify_job(moved) == before
+    moved_job = make_job(tmp_path / "elsewhere" / "run_*", *FORCE, "sequences=3")
+    assert identity.identify_job(moved_job) == old_identity
     file = tmp_path / "elsewhere" / "run_b" / file.name
     file.write_text(file.read_text().replace("0.1", "0.2", 1))
-    assert identity.identify_job(moved) != before
+    assert identity.identify_job(moved_job) != old_identity
 
 
 @pytest.mark.parametrize("form", ["binary", "recorder", "npz"])

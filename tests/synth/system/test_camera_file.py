@@ -40,8 +40,8 @@ INI = f"[StereoLeft]\n{SIDE}[StereoRight]\n{SIDE}T_0=-4.4\nT_1=0\nT_2=0\n"
 INI += "".join(f"R_{k}={x}\n" for k, x in enumerate(np.eye(3).ravel()))
 
 
-def pair(**changed: object) -> str:
-    return json.dumps({"K1": K, "D1": D, "K2": K, "D2": D, "R": TURN, "T": [-4.4, 0, 0], **changed})
+def write_pair(**changes: object) -> str:
+    return json.dumps({"K1": K, "D1": D, "K2": K, "D2": D, "R": TURN, "T": [-4.4, 0, 0], **changes})
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def pair(**changed: object) -> str:
     [
         ("a.yaml", ROS),
         ("a.yaml", KALIBR),
-        ("a.json", pair()),
+        ("a.json", write_pair()),
         ("a.yaml", f"height: 480\nwidth: 640\nd: {D}\nk: {FLAT}\nroi: {{width: 0, height: 0}}\n---\n"),
         ("a.json", json.dumps({"mtx": str(np.array(K)), "dist": [D]})),
         ("a.json", json.dumps({"fx": 800, "fy": 801, "cx": 320.5, "cy": 238.5, "k1": -0.2, "k2": 0.05})),
@@ -57,8 +57,8 @@ def pair(**changed: object) -> str:
 )
 def test_one_camera_of_every_program_is_read(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    found, lens = read_lens(tmp_path / name, (640, 480))
-    np.testing.assert_allclose(found, K)
+    matrix, lens = read_lens(tmp_path / name, (640, 480))
+    np.testing.assert_allclose(matrix, K)
     np.testing.assert_allclose(lens[:2], D[:2])
 
 
@@ -72,11 +72,11 @@ def test_what_opencv_wrote_is_read_and_another_size_of_the_same_shape_keeps_the_
         storage.write(key, value)
     storage.release()
     for width, height in ((640, 480), (320, 240)):
-        found, lens = camera_calibration.read(tmp_path / name, (width, height))
+        matrix, lens = camera_calibration.read(tmp_path / name, (width, height))
         np.testing.assert_allclose(lens, D)
-        assert found[0, 0] == pytest.approx(K[0][0] * width / 640)
+        assert matrix[0, 0] == pytest.approx(K[0][0] * width / 640)
         # The corner of the picture, half a pixel outside the first centre, is where it was.
-        assert (-0.5 - found[0, 2]) / found[0, 0] == pytest.approx((-0.5 - K[0][2]) / K[0][0])
+        assert (-0.5 - matrix[0, 2]) / matrix[0, 0] == pytest.approx((-0.5 - K[0][2]) / K[0][0])
     with pytest.raises(UserError):
         camera_calibration.read(tmp_path / name, (640, 360))
 
@@ -92,33 +92,37 @@ def test_a_pair_is_read_and_scaled_to_the_pictures(
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "pattern"),
     [
         (ROS.replace("plumb_bob", "equidistant"), "equidistant"),
         (KALIBR.replace("pinhole", "omni"), "omni"),
-        (pair(fisheye_model=1), "fisheye_model"),
-        (pair(thin_prism_coefficients=[0.1, 0.1]), "thin_prism"),
-        (pair(K1=np.transpose(K).tolist()), "319.5, 237.5"),
-        (pair(R=(1.1 * np.eye(3)).tolist()), "not a rotation"),
-        (pair(D1=[0, 0, 0, 0, 0, 1]), "6 distortion coefficients"),
-        (pair(K1=[[1800, 0, 960], [0, 1800, 540], [0, 0, 1]]), "960, 540"),
-        (pair(D2=[-0.2, 0.05, 0.08, 0.001, 0.002]), "0.08"),
-        (pair(T=[-0.0044, 0, 0]), "mm_per_unit.*1000"),
-        (pair(image_size=[1920, 1080]), "1920 x 1080"),
+        (write_pair(fisheye_model=1), "fisheye_model"),
+        (write_pair(thin_prism_coefficients=[0.1, 0.1]), "thin_prism"),
+        (write_pair(K1=np.transpose(K).tolist()), "319.5, 237.5"),
+        (write_pair(R=(1.1 * np.eye(3)).tolist()), "not a rotation"),
+        (write_pair(D1=[0, 0, 0, 0, 0, 1]), "6 distortion coefficients"),
+        (write_pair(K1=[[1800, 0, 960], [0, 1800, 540], [0, 0, 1]]), "960, 540"),
+        (write_pair(D2=[-0.2, 0.05, 0.08, 0.001, 0.002]), "0.08"),
+        (write_pair(T=[-0.0044, 0, 0]), "mm_per_unit.*1000"),
+        (write_pair(image_size=[1920, 1080]), "1920 x 1080"),
         ('{"a": ' + "[" * 500_000, "recursion"),
     ],
 )
-def test_what_is_not_supported_is_named(text: str, named: str, tmp_path: Path) -> None:
+def test_what_is_not_supported_is_named(text: str, pattern: str, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(UserError, match=named) as caught:
+    with pytest.raises(UserError, match=pattern) as error:
         read_rig(tmp_path / "a.yaml", (640, 480))
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 def test_the_baseline_is_that_of_a_pair_also_of_equal_cameras(tmp_path: Path) -> None:
-    alone = json.dumps({"K": K, "D": D, "R": TURN, "T": [-4.4, 0, 0]})
-    file, of_a_pair = tmp_path / "a.json", (pair(), pair().replace('"K', '"M'), KALIBR)
-    for text, baseline_mm in (*((one, 4.4) for one in of_a_pair), (alone, 0.0), ("damaged", 0.0)):
+    lone_camera = json.dumps({"K": K, "D": D, "R": TURN, "T": [-4.4, 0, 0]})
+    file, pair_files = tmp_path / "a.json", (write_pair(), write_pair().replace('"K', '"M'), KALIBR)
+    for text, baseline_mm in (
+        *((content, 4.4) for content in pair_files),
+        (lone_camera, 0.0),
+        ("damaged", 0.0),
+    ):
         file.write_text(text)
         assert find_baseline_mm(file) == pytest.approx(baseline_mm)
 
@@ -183,9 +187,9 @@ PRINTED = f"[ 640x480  p[{CX} {CY}]  f[{FX} {FY}]  Inverse Brown Conrady [0 0 0 
 )
 def test_cameras_of_further_programs_are_read(text: str, lens: list[float], tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(text)
-    found, distortion = read_lens(tmp_path / "a.txt", (640, 480))
+    matrix, distortion = read_lens(tmp_path / "a.txt", (640, 480))
     # Metashape states one focal length.
-    np.testing.assert_allclose(found[[0, 0, 1], [0, 2, 2]], [FX, CX, CY], atol=1e-6)
+    np.testing.assert_allclose(matrix[[0, 0, 1], [0, 2, 2]], [FX, CX, CY], atol=1e-6)
     np.testing.assert_allclose(distortion, [*lens, *[0.0] * (len(distortion) - len(lens))], atol=1e-9)
     assert bool(describe(tmp_path / "a.txt")) == (not lens and text != PRINTED)
 
@@ -228,16 +232,16 @@ def test_pairs_of_further_programs_are_read(text: str, turn: np.ndarray, tmp_pat
 def test_a_region_and_binning_of_the_sensor_are_heeded(tmp_path: Path) -> None:
     roi = "binning_x: 2\nbinning_y: 2\nroi: {x_offset: 200, y_offset: 100, height: 360, width: 400}\n"
     (tmp_path / "a.yaml").write_text(ROS + roi)
-    found, _ = read_lens(tmp_path / "a.yaml", (200, 180))
+    matrix, _ = read_lens(tmp_path / "a.yaml", (200, 180))
     # A pixel of the picture is two of the sensor, and its corner is at the region's.
-    np.testing.assert_allclose(found[[0, 1], [0, 1]], [FX / 2, FY / 2])
-    np.testing.assert_allclose(found[:2, 2], [(CX + 0.5 - 200) / 2 - 0.5, (CY + 0.5 - 100) / 2 - 0.5])
+    np.testing.assert_allclose(matrix[[0, 1], [0, 1]], [FX / 2, FY / 2])
+    np.testing.assert_allclose(matrix[:2, 2], [(CX + 0.5 - 200) / 2 - 0.5, (CY + 0.5 - 100) / 2 - 0.5])
     with pytest.raises(UserError, match="200 x 180"):
         read_lens(tmp_path / "a.yaml", (640, 480))
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "pattern"),
     [
         ("1 OPENCV_FISHEYE 640 480 800 801 320 240 0 0 0 0\n", "OPENCV_FISHEYE"),
         ("1 PINHOLE 640 480 800 801 320 240\n2 PINHOLE 640 480 800 801 320 240\n", "2 cameras"),
@@ -246,11 +250,11 @@ def test_a_region_and_binning_of_the_sensor_are_heeded(tmp_path: Path) -> None:
         ("[LEFT_CAM_HD]\nfx=700\n[STEREO]\nBaseline=120\n", "ZED"),
         (f"camera_matrix: {K}\ndistortion: [-0.3, 0.1, 0.02, 0.0004, -0.0007]\n", "k3"),
         (json.dumps({"fx": 0.9, "fy": 1.2, "cx": 0.5, "cy": 0.5}), "multiply"),
-        (pair(T=[1e150, 0, 0]), "T of"),
-        (pair(K1=[[1e150, 0, 320], [0, 1e150, 240], [0, 0, 1]]), "e\\+150"),
+        (write_pair(T=[1e150, 0, 0]), "T of"),
+        (write_pair(K1=[[1e150, 0, 320], [0, 1e150, 240], [0, 0, 1]]), "e\\+150"),
     ],
 )
-def test_further_models_and_numbers_are_refused_by_name(text: str, named: str, tmp_path: Path) -> None:
+def test_further_models_and_numbers_are_refused_by_name(text: str, pattern: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(UserError, match=named):
+    with pytest.raises(UserError, match=pattern):
         read_rig(tmp_path / "a.json", (640, 480))

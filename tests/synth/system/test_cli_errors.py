@@ -10,7 +10,7 @@ from synth.errors import UserError
 from synth.system.cli_errors import Commands
 
 
-def ended(error: BaseException) -> tuple[int, str, BaseException | None]:
+def run_failing(error: BaseException) -> tuple[int, str, BaseException | None]:
     app = typer.Typer(cls=Commands)
 
     @app.command()
@@ -21,12 +21,12 @@ def ended(error: BaseException) -> tuple[int, str, BaseException | None]:
     def other() -> None:
         """A second command: with one alone there is no group."""
 
-    done = CliRunner().invoke(app, ["fail"])
-    return done.exit_code, done.stderr, done.exception
+    result = CliRunner().invoke(app, ["fail"])
+    return result.exit_code, result.stderr, result.exception
 
 
 @pytest.mark.parametrize(
-    ("error", "named"),
+    ("error", "message"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "a/score.json"), "a/score.json: No space left"),
         (OSError(errno.EACCES, "Permission denied", "a"), "Permission denied"),
@@ -35,14 +35,14 @@ def ended(error: BaseException) -> tuple[int, str, BaseException | None]:
         (MemoryError(), "memory"),
     ],
 )
-def test_errors_of_the_machine_are_one_line(error: Exception, named: str) -> None:
-    code, errors, _ = ended(error)
+def test_errors_of_the_machine_are_one_line(error: Exception, message: str) -> None:
+    code, errors, _ = run_failing(error)
     assert (code, errors.count("\n")) == (2, 1)
-    assert named in errors
+    assert message in errors
 
 
 def test_control_characters_of_names_are_escaped() -> None:
-    assert ended(UserError("a\x1b[31m\nb\u202e"))[:2] == (2, "error: a\\x1b[31m\nb\\u202e\n")
+    assert run_failing(UserError("a\x1b[31m\nb\u202e"))[:2] == (2, "error: a\\x1b[31m\nb\\u202e\n")
 
 
 OWN_MODULE = ModuleNotFoundError("No module named 'synth.shop'", name="synth.shop")
@@ -50,4 +50,4 @@ OWN_MODULE = ModuleNotFoundError("No module named 'synth.shop'", name="synth.sho
 
 @pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), ValueError("a bug"), OWN_MODULE])
 def test_bugs_are_not_hidden(error: Exception) -> None:
-    assert ended(error) == (1, "", error)
+    assert run_failing(error) == (1, "", error)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-LACKS = {
+LACKING = {
     "Windows": "sys.modules['fcntl'] = sys.modules['resource'] = None; del os.getuid, "
     "os.sched_getaffinity, os.sysconf;"
     "platform.system = lambda: 'Windows'",
@@ -15,12 +15,12 @@ LACKS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("system", LACKS)
+@pytest.mark.parametrize("system", LACKING)
 def test_other_systems_are_named_as_unsupported(system: str, tmp_path: Path) -> None:
-    code = f"import sys, os, platform; {LACKS[system]}\nsys.argv = ['synth', 'doctor', {str(tmp_path)!r}]\n"
+    code = f"import sys, os, platform; {LACKING[system]}\nsys.argv = ['synth', 'doctor', {str(tmp_path)!r}]\n"
     code += "import runpy; runpy.run_module('synth', run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    lines = process.stdout.splitlines()
     assert any(line.startswith("LACK system") for line in lines)
     assert any(line.startswith("LACK fcntl") for line in lines) == (system == "Windows")

@@ -32,18 +32,18 @@ def test_a_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(fcntl, "flock", refuse)
     lock = tmp_path / "lock"
     command = [sys.executable, "-c", HOLD, str(lock)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == b"held\n"
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held\n"
         assert file_lock.is_held(lock)
         monkeypatch.setattr(file_lock, "_WAIT_S", 0.2 - file_lock._LEASE_S)
         with pytest.raises(file_lock.Locked), file_lock.hold(lock):
             pass
-        other.kill()
+        process.kill()
     monkeypatch.setattr(file_lock, "_WAIT_S", 5)
-    begun = time.monotonic()
+    begin_s = time.monotonic()
     with file_lock.hold(lock):  # a dead process's lease is not waited for
-        assert time.monotonic() - begun < 10
+        assert time.monotonic() - begin_s < 10
         assert file_lock.is_held(lock)
     assert not file_lock.is_held(lock)
 

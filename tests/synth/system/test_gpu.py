@@ -6,7 +6,7 @@ from synth.system.gpu import Gpu, obstacle
 
 
 @pytest.mark.parametrize(
-    ("gpu", "fit"),
+    ("gpu", "is_usable"),
     [
         (None, False),
         (Gpu(1, "550.54.14", (9, 0), optix=True), True),
@@ -18,5 +18,5 @@ from synth.system.gpu import Gpu, obstacle
         (Gpu(1, "", (8, 0), optix=True), True),  # an unknown driver is tried
     ],
 )
-def test_drivers_and_devices_that_the_renderer_runs_on(gpu: Gpu | None, fit: bool) -> None:
-    assert (obstacle(gpu) is None) is fit
+def test_drivers_and_devices_that_the_renderer_runs_on(gpu: Gpu | None, is_usable: bool) -> None:
+    assert (obstacle(gpu) is None) is is_usable

@@ -12,11 +12,11 @@ from synth.system import cache, llvm
 def test_a_library_that_works_is_tried_once_and_one_that_fails_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tried, codes = list[str](), [1, 1, 0]
+    attempts, codes = list[str](), [1, 1, 0]
 
     def run(words: list[str], env: dict[str, str], **_: object) -> SimpleNamespace:
-        tried.append(env["DRJIT_LIBLLVM_PATH"])
-        return SimpleNamespace(returncode=codes[min(len(tried), 3) - 1])
+        attempts.append(env["DRJIT_LIBLLVM_PATH"])
+        return SimpleNamespace(returncode=codes[min(len(attempts), 3) - 1])
 
     monkeypatch.setattr(cache, "folder", lambda name: tmp_path)
     monkeypatch.setattr(subprocess, "run", run)
@@ -24,7 +24,7 @@ def test_a_library_that_works_is_tried_once_and_one_that_fails_each_time(
     assert not llvm.probe(str(library))
     library.write_bytes(b"one")
     assert [llvm.probe(str(library)) for _ in range(4)] == [False, False, True, True]
-    assert tried == 3 * [str(library)]
+    assert attempts == 3 * [str(library)]
     library.write_bytes(b"another")  # an update
     assert llvm.probe(str(library))
-    assert len(tried) == 4
+    assert len(attempts) == 4

@@ -36,15 +36,15 @@ TABLE = "time,fx,fy,fz,x,y,z\n0,0,0,0,1,0,0\n0.2,1.5,0,-4,1,0,0\n0.5,0,0,0,1,0,0
 
 
 @contextmanager
-def limited(more: int) -> Iterator[None]:
+def limit_memory(extra_bytes: int) -> Iterator[None]:
     """Memory that the process may take beyond what it has [bytes]."""
-    size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (size + more, before[1]))
+    used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    old_limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used_bytes + extra_bytes, old_limits[1]))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        resource.setrlimit(resource.RLIMIT_AS, old_limits)
 
 
 def glb(tree: dict[str, Any]) -> bytes:
@@ -59,7 +59,7 @@ def read(source: Path, mm: float = 1.0, mn: float = 1.0, force: str | None = FOR
     return read_series(source, Units(mm, mn, STEP_S), force)
 
 
-def ordered(series: MeshSeries) -> list[Floats]:
+def order_arrays(series: MeshSeries) -> list[Floats]:
     """Points at rest, and displacement and force of the third state, in an order that all formats share."""
     assert series.force is not None
     order = np.lexsort(series.points.round(3).T)
@@ -75,25 +75,28 @@ def test_sofas_recorder_on_the_page_writes_a_series(tmp_path: Path, monkeypatch:
     sofa.Core = core  # type: ignore[attr-defined]
     for module in (sofa, core):
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    space, (mm, mn) = dict[str, Any](), (1000.0, 1000.0)
-    exec(code, space)
+    namespace, (mm, mn) = dict[str, Any](), (1000.0, 1000.0)
+    exec(code, namespace)
     block = solve()
-    held = {"lambda": SimpleNamespace(value=np.zeros((0, 3)))}
-    tissue = SimpleNamespace(position=SimpleNamespace(value=block.points / mm), getData=held.__getitem__)
+    fields = {"lambda": SimpleNamespace(value=np.zeros((0, 3)))}
+    tissue = SimpleNamespace(position=SimpleNamespace(value=block.points / mm), getData=fields.__getitem__)
     root = SimpleNamespace(time=SimpleNamespace(value=0.0))
     solver = SimpleNamespace(constraintForces=SimpleNamespace(value=[]))
-    recorder = space["Recorder"](root, solver, tissue, block.tets)
-    for k, part in enumerate(block.scale[1:], 1):
-        root.time.value, touched = STEP_S * k, part > 0
-        tissue.position.value = (block.points + part * block.u) / mm
-        solver.constraintForces.value = [1.0] if touched else []
-        held["lambda"].value = part * block.force / mn if touched else np.zeros((0, 3))
+    recorder = namespace["Recorder"](root, solver, tissue, block.tets)
+    for k, scale in enumerate(block.scale[1:], 1):
+        root.time.value, in_contact = STEP_S * k, scale > 0
+        tissue.position.value = (block.points + scale * block.u) / mm
+        solver.constraintForces.value = [1.0] if in_contact else []
+        fields["lambda"].value = scale * block.force / mn if in_contact else np.zeros((0, 3))
         recorder.onAnimateEndEvent(None)
     recorder.save(tmp_path / "press.npz")
-    found, true = read(tmp_path / "press.npz", mm, mn), read(write(tmp_path / "s", "points", mm, mn), mm, mn)
-    assert found.time == pytest.approx(true.time)
-    for one, other in zip(ordered(found), ordered(true), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(other).max())
+    series, expected = (
+        read(tmp_path / "press.npz", mm, mn),
+        read(write(tmp_path / "s", "points", mm, mn), mm, mn),
+    )
+    assert series.time == pytest.approx(expected.time)
+    for array, expected_array in zip(order_arrays(series), order_arrays(expected), strict=True):
+        np.testing.assert_allclose(array, expected_array, atol=1e-6 * np.abs(expected_array).max())
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -101,10 +104,10 @@ def test_sofas_recorder_on_the_page_writes_a_series(tmp_path: Path, monkeypatch:
 def test_every_format_and_unit_gives_the_same_states(form: str, mm: float, mn: float, tmp_path: Path) -> None:
     block, series = solve(), read(write(tmp_path / "s", form, mm, mn), mm, mn)
     assert series.time == pytest.approx(STEP_S * np.arange(STATES))
-    outer = np.isclose(np.abs(block.points - [0, 0, -9]), [24, 24, 9]).any(axis=1)
-    order = np.flatnonzero(outer)[np.lexsort(block.points[outer].round(3).T)]
-    for found, true in zip(ordered(series), (block.points, block.u, block.force), strict=True):
-        np.testing.assert_allclose(found, true[order], atol=3e-6 * np.abs(true).max())
+    boundary = np.isclose(np.abs(block.points - [0, 0, -9]), [24, 24, 9]).any(axis=1)
+    order = np.flatnonzero(boundary)[np.lexsort(block.points[boundary].round(3).T)]
+    for values, expected in zip(order_arrays(series), (block.points, block.u, block.force), strict=True):
+        np.testing.assert_allclose(values, expected[order], atol=3e-6 * np.abs(expected).max())
     assert series.force is not None
     np.testing.assert_allclose(series.force[2].sum(axis=0), -block.reaction, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(
@@ -136,8 +139,8 @@ def test_a_table_gives_the_total_force_at_its_place(tmp_path: Path) -> None:
 def test_traction_is_force_over_the_area_at_rest(tmp_path: Path) -> None:
     for mm in (1.0, 1000.0):
         source = write(tmp_path / str(mm), "npz", mm)
-        with np.load(source) as held:
-            arrays = dict(held)
+        with np.load(source) as file:
+            arrays = dict(file)
         pressure = np.where(
             np.isclose(arrays["rest"][:, 2:], 0), [0, 0, -0.5 * mm**2], 0
         )  # mN per unit of area
@@ -151,56 +154,58 @@ def test_traction_is_force_over_the_area_at_rest(tmp_path: Path) -> None:
 
 def test_coincident_nodes_count_once_and_their_loads_add_up(tmp_path: Path) -> None:
     block, source = solve(), write(tmp_path, "npz")
-    with np.load(source) as held:
-        arrays = dict(held)
-    single = block.tets.ravel()  # a node for each corner of each cell, as discontinuous elements have
-    share = 1 / np.bincount(single)[single]
-    arrays |= {"rest": arrays["rest"][single], "displacement": arrays["displacement"][:, single]}
-    arrays |= {"contact": arrays["contact"][:, single] * share[:, None]}
-    np.savez(tmp_path / "t.npz", **arrays | {"tetrahedra": np.arange(single.size).reshape(-1, 4)})
-    for found, true in zip(ordered(read(tmp_path / "t.npz")), ordered(read(source)), strict=True):
-        np.testing.assert_allclose(found, true, atol=1e-6)
+    with np.load(source) as file:
+        arrays = dict(file)
+    corner_nodes = block.tets.ravel()  # a node for each corner of each cell, as discontinuous elements have
+    share = 1 / np.bincount(corner_nodes)[corner_nodes]
+    arrays |= {"rest": arrays["rest"][corner_nodes], "displacement": arrays["displacement"][:, corner_nodes]}
+    arrays |= {"contact": arrays["contact"][:, corner_nodes] * share[:, None]}
+    np.savez(tmp_path / "t.npz", **arrays | {"tetrahedra": np.arange(corner_nodes.size).reshape(-1, 4)})
+    for values, expected in zip(
+        order_arrays(read(tmp_path / "t.npz")), order_arrays(read(source)), strict=True
+    ):
+        np.testing.assert_allclose(values, expected, atol=1e-6)
 
 
 def change(name: str, old: str, new: str, form: str = "ascii") -> Callable[[Path], Path]:
     """A series with the first match of a pattern in one of its files replaced."""
 
-    def made(folder: Path) -> Path:
+    def write_series(folder: Path) -> Path:
         source, file = write(folder, form), folder / name
         text = file.read_text("latin-1")
         assert re.search(old, text, re.DOTALL)
         file.write_text(re.sub(old, new, text, count=1, flags=re.DOTALL), "latin-1")
         return source
 
-    return made
+    return write_series
 
 
-def arrays(**changed: Callable[[Floats], Floats] | None) -> Callable[[Path], Path]:
+def edit(**changes: Callable[[Floats], Floats] | None) -> Callable[[Path], Path]:
     """An .npz with arrays changed, or left out."""
 
-    def made(folder: Path) -> Path:
+    def write_series(folder: Path) -> Path:
         source = write(folder, "npz")
-        with np.load(source) as held:
-            every = dict(held)
-        for name, how in changed.items():
-            value = every.pop(name)
-            every |= {} if how is None else {name: how(value)}
-        np.savez(source, **every)
+        with np.load(source) as file:
+            contents = dict(file)
+        for name, function in changes.items():
+            value = contents.pop(name)
+            contents |= {} if function is None else {name: function(value)}
+        np.savez(source, **contents)
         return source
 
-    return made
+    return write_series
 
 
-def without(name: str, form: str) -> Callable[[Path], Path]:
-    def made(folder: Path) -> Path:
+def omit_file(name: str, form: str) -> Callable[[Path], Path]:
+    def write_series(folder: Path) -> Path:
         source = write(folder, form)
         (folder / name).unlink()
         return source
 
-    return made
+    return write_series
 
 
-def remeshed(folder: Path) -> Path:
+def remesh_state(folder: Path) -> Path:
     source = write(folder, "ascii")
     block = solve(4.0)
     fields = {"displacement": block.u, "contact": block.force}
@@ -208,50 +213,50 @@ def remeshed(folder: Path) -> Path:
     return source
 
 
-def two_series(folder: Path) -> Path:
+def write_two_series(folder: Path) -> Path:
     write(folder, "ascii")
     (folder / "tool_0.vtu").write_bytes((folder / "block_0.vtu").read_bytes())
     return folder
 
 
-def apart(tets: Ints) -> Ints:
+def remove_middle(tets: Ints) -> Ints:
     """Without the cells in the middle."""
     return tets[solve().points[tets][..., 0].mean(axis=1) ** 2 > 25]
 
 
-def first(one: Floats) -> Floats:
-    return one[:1]
+def keep_first(values: Floats) -> Floats:
+    return values[:1]
 
 
-def first_none(one: Floats) -> Floats:
-    return one[:0]
+def drop_rows(values: Floats) -> Floats:
+    return values[:0]
 
 
-def none(one: Floats) -> Floats:
-    return one[:, :0]
+def drop_columns(values: Floats) -> Floats:
+    return values[:, :0]
 
 
-def as_rigid(one: Floats) -> Floats:
+def make_rigid(values: Floats) -> Floats:
     """A press of 1 mm without a deformation."""
-    return 0 * one + np.outer(solve().scale, [0, 0, -1])[:, None]
+    return 0 * values + np.outer(solve().scale, [0, 0, -1])[:, None]
 
 
-def at(k: int, value: float) -> Callable[[Floats], Floats]:
-    def put(one: Floats) -> Floats:
-        one = one.astype(float)
-        one[k, 0, 0] = value
-        return one
+def set_value(k: int, value: float) -> Callable[[Floats], Floats]:
+    def put(values: Floats) -> Floats:
+        values = values.astype(float)
+        values[k, 0, 0] = value
+        return values
 
     return put
 
 
 BAD: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "a file is missing in the middle": (r"block_1\.vtu.*block_3\.vtu", without("block_2.vtu", "ascii")),
-    "a listed file is missing": (r"block_2\.vtu", without("block_2.vtu", "binary")),
-    "not a number": (r"s\.npz", arrays(displacement=at(2, np.nan))),
-    "infinite force": (r"s\.npz", arrays(contact=at(2, np.inf))),
-    "not a number at rest": (r"s\.npz", arrays(rest=lambda x: np.where(x == x[0], np.nan, x))),
-    "remeshed": (r"block_2\.vtu", remeshed),
+    "a file is missing in the middle": (r"block_1\.vtu.*block_3\.vtu", omit_file("block_2.vtu", "ascii")),
+    "a listed file is missing": (r"block_2\.vtu", omit_file("block_2.vtu", "binary")),
+    "not a number": (r"s\.npz", edit(displacement=set_value(2, np.nan))),
+    "infinite force": (r"s\.npz", edit(contact=set_value(2, np.inf))),
+    "not a number at rest": (r"s\.npz", edit(rest=lambda x: np.where(x == x[0], np.nan, x))),
+    "remeshed": (r"block_2\.vtu", remesh_state),
     "lines only": (r"block_0\.vtu", change("block_0.vtu", r"(types.*?>)[\d ]+", r"\g<1>" + "3 " * 10**4)),
     "no such field": (r"contact.*displacement", change("block_0.vtu", 'Name="contact"', 'Name="lambda"')),
     "field lost later": (r"block_3\.vtu", change("block_3.vtu", 'Name="contact"', 'Name="lambda"')),
@@ -263,50 +268,50 @@ BAD: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "empty file": (r"block_3\.vtu", change("block_3.vtu", ".*", "")),
     "other type": (r"block_0\.vtu", change("block_0.vtu", "UnstructuredGrid", "ImageData")),
     "other kind of cells": (r"42", change("block_0.vtu", r"(types.*?>)10", r"\g<1>42")),
-    "loaded at first": (r"s\.npz", arrays(contact=lambda f: f + f[2])),
-    "displaced at first": (r"s\.npz", arrays(displacement=lambda u: u + u[2])),
-    "net force": (r"net force", arrays(contact=lambda f: f * ([0, 1, 0, 1, 0] @ np.eye(5))[:, None, None])),
-    "no force at all": (r"0 mN", arrays(contact=np.zeros_like)),
+    "loaded at first": (r"s\.npz", edit(contact=lambda f: f + f[2])),
+    "displaced at first": (r"s\.npz", edit(displacement=lambda u: u + u[2])),
+    "net force": (r"net force", edit(contact=lambda f: f * ([0, 1, 0, 1, 0] @ np.eye(5))[:, None, None])),
+    "no force at all": (r"0 mN", edit(contact=np.zeros_like)),
     "times run back": (r"block_3\.vtu", change("block.pvd", r'"0\.3\d*"', '"0.1"', "binary")),
-    "times missing": (r"s\.npz", arrays(times=lambda t: np.zeros_like(t))),
-    "metres as millimetres": (r"1000 for m", arrays(rest=lambda x: x / 1e3, displacement=lambda u: u / 1e3)),
-    "mixed units": (r"s\.npz.*unit_mm", arrays(displacement=lambda u: u / 1e5)),
-    "several series": (r"block_\*\.vtu, tool_\*\.vtu", two_series),
-    "one state": (r"s\.npz", arrays(displacement=first, contact=first, times=first)),
-    "no cells": (r"s\.npz", arrays(tetrahedra=None)),
-    "shapes differ": (r"\(5, .*\(4,", arrays(times=lambda t: t[:4])),
-    "one number of time": (r"s\.npz", arrays(times=lambda t: t[0])),
-    "one number of motion": (r"s\.npz", arrays(displacement=lambda u: u[0, 0, 0])),
+    "times missing": (r"s\.npz", edit(times=lambda t: np.zeros_like(t))),
+    "metres as millimetres": (r"1000 for m", edit(rest=lambda x: x / 1e3, displacement=lambda u: u / 1e3)),
+    "mixed units": (r"s\.npz.*unit_mm", edit(displacement=lambda u: u / 1e5)),
+    "several series": (r"block_\*\.vtu, tool_\*\.vtu", write_two_series),
+    "one state": (r"s\.npz", edit(displacement=keep_first, contact=keep_first, times=keep_first)),
+    "no cells": (r"s\.npz", edit(tetrahedra=None)),
+    "shapes differ": (r"\(5, .*\(4,", edit(times=lambda t: t[:4])),
+    "one number of time": (r"s\.npz", edit(times=lambda t: t[0])),
+    "one number of motion": (r"s\.npz", edit(displacement=lambda u: u[0, 0, 0])),
     "one number of motion without times": (
-        r"s\.npz", arrays(displacement=lambda u: u[0, 0, 0], times=None),
+        r"s\.npz", edit(displacement=lambda u: u[0, 0, 0], times=None),
     ),
-    "duplicate nodes that part": (r"s\.npz", arrays(rest=lambda x: np.where(x == x[7], x[8], x))),
-    "separate bodies": (r"2 separate", arrays(tetrahedra=apart)),
+    "duplicate nodes that part": (r"s\.npz", edit(rest=lambda x: np.where(x == x[7], x[8], x))),
+    "separate bodies": (r"2 separate", edit(tetrahedra=remove_middle)),
     "a collection of nothing": (r"block\.pvd", change("block.pvd", "<DataSet.*/>", "", "binary")),
     "a file outside": (r"\.\./b", change("block.pvd", 'file="b', 'file="../b', "binary")),
-    "motion of a wrong unit": ("times the width", arrays(displacement=lambda u: 1000 * u)),
-    "motion of 1e30 mm": (r"s\.npz", arrays(displacement=at(2, 1e30))),
-    "forces of 1e300 mN": (r"s\.npz", arrays(contact=lambda f: 1e300 * f)),
-    "a rigid motion with a force": ("rigid", arrays(displacement=as_rigid)),
-    "a zero state midway": ("state 2", arrays(displacement=lambda u: u * (np.arange(5) != 2)[:, None, None])),
-    "faces that are not whole": ("whole", arrays(tetrahedra=lambda t: t + 0.5)),
-    "an infinite last time": ("inf", arrays(times=lambda t: np.append(t[:-1], np.inf))),
-    "times of 1e308 s": ("308", arrays(times=lambda t: np.array([-1.7e308, 0, 1, 2, 1.7e308]))),
-    "no points": (r"s\.npz", arrays(rest=first_none, displacement=none, contact=none)),
+    "motion of a wrong unit": ("times the width", edit(displacement=lambda u: 1000 * u)),
+    "motion of 1e30 mm": (r"s\.npz", edit(displacement=set_value(2, 1e30))),
+    "forces of 1e300 mN": (r"s\.npz", edit(contact=lambda f: 1e300 * f)),
+    "a rigid motion with a force": ("rigid", edit(displacement=make_rigid)),
+    "a zero state midway": ("state 2", edit(displacement=lambda u: u * (np.arange(5) != 2)[:, None, None])),
+    "faces that are not whole": ("whole", edit(tetrahedra=lambda t: t + 0.5)),
+    "an infinite last time": ("inf", edit(times=lambda t: np.append(t[:-1], np.inf))),
+    "times of 1e308 s": ("308", edit(times=lambda t: np.array([-1.7e308, 0, 1, 2, 1.7e308]))),
+    "no points": (r"s\.npz", edit(rest=drop_rows, displacement=drop_columns, contact=drop_columns)),
     "another engine's format": (r"\.frd.*VTU", lambda folder: folder / "block.frd"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_a_bad_series_is_refused_in_one_line_that_names_it(what: str, tmp_path: Path) -> None:
-    named, made = BAD[what]
-    source = made(tmp_path)
-    with pytest.raises(UserError, match=named) as refused:
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_series_is_refused_in_one_line_that_names_it(case: str, tmp_path: Path) -> None:
+    pattern, write_case = BAD[case]
+    source = write_case(tmp_path)
+    with pytest.raises(UserError, match=pattern) as error:
         read(source)
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(error.value)
 
 
-def no_doubts(source: Path, young_kpa: float | None = 1.0) -> list[str]:
+def find_doubts(source: Path, young_kpa: float | None = 1.0) -> list[str]:
     """All that is doubtful in a series."""
     series = read(source)
     return [*series.cautions, *doubt_load(series, young_kpa)]
@@ -323,48 +328,48 @@ def exchange(state: int, *nodes: int) -> Callable[[Floats], Floats]:
     return put
 
 
-def nearest(*place: float) -> int:
+def find_nearest(*place: float) -> int:
     return int(np.linalg.norm(solve().points - place, axis=1).argmin())
 
 
-MIDDLE = nearest(0, 0, 0)
+MIDDLE = find_nearest(0, 0, 0)
 
 DOUBTFUL: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "newtons taken for millinewtons": (r"P = 4\.1e\+02.*", arrays(contact=lambda f: 1000 * f)),
-    "millinewtons taken for newtons": (r"P = 0\.00041", arrays(contact=lambda f: f / 1000)),
-    "reaction instead of load": ("negative work", arrays(contact=lambda f: -f)),
-    "y and z of the load swapped": ("80 degrees", arrays(contact=lambda f: f[..., [0, 2, 1]])),
-    "y and z of the motion swapped": ("80 degrees", arrays(displacement=lambda u: u[..., [0, 2, 1]])),
-    "load on other nodes": ("don't move", arrays(contact=lambda f: f[:, ::-1])),
-    "load a state late": ("state 4", arrays(contact=lambda f: np.stack([0 * f[0], *f[:3], f[1]]))),
-    "ms taken for s": (r"over 400 s", arrays(times=lambda t: 1000 * t)),
-    "s taken for ms": (r"over 0\.0004 s", arrays(times=lambda t: t / 1000)),
+    "newtons taken for millinewtons": (r"P = 4\.1e\+02.*", edit(contact=lambda f: 1000 * f)),
+    "millinewtons taken for newtons": (r"P = 0\.00041", edit(contact=lambda f: f / 1000)),
+    "reaction instead of load": ("negative work", edit(contact=lambda f: -f)),
+    "y and z of the load swapped": ("80 degrees", edit(contact=lambda f: f[..., [0, 2, 1]])),
+    "y and z of the motion swapped": ("80 degrees", edit(displacement=lambda u: u[..., [0, 2, 1]])),
+    "load on other nodes": ("don't move", edit(contact=lambda f: f[:, ::-1])),
+    "load a state late": ("state 4", edit(contact=lambda f: np.stack([0 * f[0], *f[:3], f[1]]))),
+    "ms taken for s": (r"over 400 s", edit(times=lambda t: 1000 * t)),
+    "s taken for ms": (r"over 0\.0004 s", edit(times=lambda t: t / 1000)),
     "two nodes": (
-        f"nodes {min(nearest(0, 0, 0), nearest(3, 0, 0))}, .* state 3:",
-        arrays(displacement=exchange(3, nearest(0, 0, 0), nearest(3, 0, 0))),
+        f"nodes {min(find_nearest(0, 0, 0), find_nearest(3, 0, 0))}, .* state 3:",
+        edit(displacement=exchange(3, find_nearest(0, 0, 0), find_nearest(3, 0, 0))),
     ),
-    "two nodes far apart": ("state 3:", arrays(displacement=exchange(3, MIDDLE, nearest(-18, 9, 0)))),
+    "two nodes far apart": ("state 3:", edit(displacement=exchange(3, MIDDLE, find_nearest(-18, 9, 0)))),
     "three nodes in turn": (
         "state 1:",
-        arrays(displacement=exchange(1, nearest(0, 0, 0), nearest(3, 0, 0), nearest(0, 3, 0))),
+        edit(displacement=exchange(1, find_nearest(0, 0, 0), find_nearest(3, 0, 0), find_nearest(0, 3, 0))),
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", DOUBTFUL)
-def test_what_is_unlikely_of_tissue_is_said(what: str, tmp_path: Path) -> None:
-    named, made = DOUBTFUL[what]
-    doubts = no_doubts(made(tmp_path))
-    assert len([one for one in doubts if re.search(named, one)]) == 1
-    assert not any("\n" in one for one in doubts)
+@pytest.mark.parametrize("case", DOUBTFUL)
+def test_what_is_unlikely_of_tissue_is_said(case: str, tmp_path: Path) -> None:
+    pattern, write_case = DOUBTFUL[case]
+    doubts = find_doubts(write_case(tmp_path))
+    assert len([doubt for doubt in doubts if re.search(pattern, doubt)]) == 1
+    assert not any("\n" in doubt for doubt in doubts)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7])
 @pytest.mark.parametrize(
-    ("axis", "sideways", "doubts"), [(None, 0.1, 0), (0, 0.1, 1), (1, -0.1, 1), (0, 0.005, 0)]
+    ("axis", "sideways", "doubt_count"), [(None, 0.1, 0), (0, 0.1, 1), (1, -0.1, 1), (0, 0.005, 0)]
 )
 def test_a_mirrored_motion_under_a_press_is_doubted(
-    axis: int | None, sideways: float, doubts: int, turn: float
+    axis: int | None, sideways: float, doubt_count: int, turn: float
 ) -> None:
     """Of a dimple under which tissue moves towards its middle by a share of the distance."""
     side = np.linspace(-15, 15, 31)
@@ -377,8 +382,10 @@ def test_a_mirrored_motion_under_a_press_is_doubted(
     tilt = Rotation.from_euler("xyz", [turn, turn, turn]).as_matrix()
     points, u, load = flat @ tilt.T, u @ tilt.T, load @ tilt.T
     faces = Delaunay(flat[:, :2]).simplices
-    found = plausibility.find_mirror_doubt(points, faces, np.stack([0 * u, u]), np.stack([0 * u, load]))
-    assert len(found) == doubts
+    mirror_doubts = plausibility.find_mirror_doubt(
+        points, faces, np.stack([0 * u, u]), np.stack([0 * u, load])
+    )
+    assert len(mirror_doubts) == doubt_count
 
 
 def press(states: int) -> tuple[Floats, Floats]:
@@ -386,57 +393,57 @@ def press(states: int) -> tuple[Floats, Floats]:
     time = np.linspace(0, 1, states)
     size = np.interp(time, [0.1, 0.4, 0.6, 0.9], [0, 1, 1, 0])
     size = size**2 * (3 - 2 * size)
-    aside = np.roll(solve().u, 1, axis=1)
-    return size[:, None, None] * (solve().u + 0.3 * time[:, None, None] * aside), time
+    shift = np.roll(solve().u, 1, axis=1)
+    return size[:, None, None] * (solve().u + 0.3 * time[:, None, None] * shift), time
 
 
 @pytest.mark.parametrize("states", [12, 20, 40])
 def test_two_states_that_changed_places_are_named(states: int) -> None:
     u, time = press(states)
     assert plausibility.find_exchanged_states(u, time) == []
-    one, other = states // 5, states // 2
-    u[[one, other]] = u[[other, one]]
+    first_state, second_state = states // 5, states // 2
+    u[[first_state, second_state]] = u[[second_state, first_state]]
     (doubt,) = plausibility.find_exchanged_states(u, time)
-    assert f"states {one} and {other} " in doubt
+    assert f"states {first_state} and {second_state} " in doubt
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_plausible_series_raises_no_doubt(form: str, tmp_path: Path) -> None:
-    assert no_doubts(write(tmp_path, form)) == []
+    assert find_doubts(write(tmp_path, form)) == []
 
 
 @pytest.mark.parametrize("factor", [1000.0, 1e-3])
 def test_a_wrong_unit_of_force_is_seen_without_a_stiffness(factor: float, tmp_path: Path) -> None:
-    (doubt,) = no_doubts(arrays(contact=lambda f: factor * f)(tmp_path), None)
+    (doubt,) = find_doubts(edit(contact=lambda f: factor * f)(tmp_path), None)
     assert f"{1.2 * factor:.1e} kPa".replace(".0e", "e") in doubt or f"{1.2 * factor:.2g} kPa" in doubt
 
 
 def test_the_contact_of_a_uniform_pressure_has_its_own_radius() -> None:
     """Of a disk of 12 mm on a fine grid, loaded evenly; of a paraboloid (3/4)^(1/2) of it."""
-    across = np.linspace(-20, 20, 161)
-    points = np.stack([*np.meshgrid(across, across), np.zeros((161, 161))], axis=-1).reshape(-1, 3)
+    axis = np.linspace(-20, 20, 161)
+    points = np.stack([*np.meshgrid(axis, axis), np.zeros((161, 161))], axis=-1).reshape(-1, 3)
     corner = np.arange(161 * 160)[np.arange(161 * 160) % 161 < 160]
     faces = np.concatenate([corner[:, None] + [0, 1, 162], corner[:, None] + [0, 162, 161]])
-    share = np.maximum(1 - (points**2).sum(axis=1) / 144, 0)[:, None] * [0, 0, -1.0]
-    assert contact_radius(points, faces, np.sign(share)) == pytest.approx(12, rel=0.01)
-    assert contact_radius(points, faces, share) == pytest.approx(12 * np.sqrt(0.75), rel=0.01)
+    load = np.maximum(1 - (points**2).sum(axis=1) / 144, 0)[:, None] * [0, 0, -1.0]
+    assert contact_radius(points, faces, np.sign(load)) == pytest.approx(12, rel=0.01)
+    assert contact_radius(points, faces, load) == pytest.approx(12 * np.sqrt(0.75), rel=0.01)
 
 
 def test_a_rigid_body_is_told_from_a_bent_one() -> None:
     points = np.random.default_rng(0).uniform(-20, 20, (500, 3))
     turn = Rotation.from_rotvec([0.1, -0.3, 0.2]).as_matrix()
-    moved = points @ turn.T + [1, 2, 3] - points
-    assert is_rigid(points, moved)
-    assert not is_rigid(points, moved + 0.05 * np.sin(points[:, :1] / 5) * [0, 0, 1.0])
+    displacement = points @ turn.T + [1, 2, 3] - points
+    assert is_rigid(points, displacement)
+    assert not is_rigid(points, displacement + 0.05 * np.sin(points[:, :1] / 5) * [0, 0, 1.0])
 
 
-def packed(*blocks: bytes, size: int, last: int = 0) -> str:
+def pack_blocks(*blocks: bytes, size: int, last_size: int = 0) -> str:
     """The base64 text of compressed blocks whose header states `size` bytes each."""
-    head = np.array([len(blocks), size, last, *map(len, blocks)], "<u4").tobytes()
+    head = np.array([len(blocks), size, last_size, *map(len, blocks)], "<u4").tobytes()
     return base64.b64encode(head).decode() + base64.b64encode(b"".join(blocks)).decode()
 
 
-def compressed(points: str, count: int, other: str = "") -> bytes:
+def build_vtu(points: str, count: int, extra_array: str = "") -> bytes:
     """A .vtu of one tetrahedron and `count` points, with another array at them."""
     text = (
         '<VTKFile type="UnstructuredGrid" byte_order="LittleEndian" compressor="vtkZLibDataCompressor">'
@@ -445,22 +452,22 @@ def compressed(points: str, count: int, other: str = "") -> bytes:
         '<DataArray type="Int32" Name="connectivity" format="ascii">0 1 2 3</DataArray>'
         '<DataArray type="Int32" Name="offsets" format="ascii">4</DataArray>'
         '<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells>'
-        f"<PointData>{other}</PointData></Piece></UnstructuredGrid></VTKFile>"
+        f"<PointData>{extra_array}</PointData></Piece></UnstructuredGrid></VTKFile>"
     )
     return text.encode()
 
 
 TETRAHEDRON = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-POINTS = packed(zlib.compress(TETRAHEDRON.astype("<f4").tobytes()), size=48)
+POINTS = pack_blocks(zlib.compress(TETRAHEDRON.astype("<f4").tobytes()), size=48)
 HUGE = zlib.compress(bytes(1 << 24))
 LEGACY = b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET UNSTRUCTURED_GRID\n"
 ENTITIES = '<!DOCTYPE x [<!ENTITY a "b">]><VTKFile type="UnstructuredGrid">&a;</VTKFile>'
 
 BOMBS = {
-    "a block larger than it states": compressed(packed(HUGE, size=48), 4),
-    "more blocks than it has": compressed("AAAAgAEAAAABAAAA", 4),
-    "all that it states, of 12 GB": compressed(packed(*[HUGE] * 768, size=1 << 24), (768 << 24) // 12),
-    "blocks of no size": compressed(packed(HUGE, size=0), 4),
+    "a block larger than it states": build_vtu(pack_blocks(HUGE, size=48), 4),
+    "more blocks than it has": build_vtu("AAAAgAEAAAABAAAA", 4),
+    "all that it states, of 12 GB": build_vtu(pack_blocks(*[HUGE] * 768, size=1 << 24), (768 << 24) // 12),
+    "blocks of no size": build_vtu(pack_blocks(HUGE, size=0), 4),
     "entities in UTF-16": ENTITIES.encode("utf-16"),
     "entities": ENTITIES.encode(),
     "cells": LEGACY + b"POINTS 1 float\n0 0 0\nCELLS 1000000000 1\n0\n",
@@ -472,19 +479,19 @@ BOMBS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", BOMBS)
-def test_what_a_mesh_declares_is_held_against_its_bytes(what: str) -> None:
+@pytest.mark.parametrize("case", BOMBS)
+def test_what_a_mesh_declares_is_held_against_its_bytes(case: str) -> None:
     """In 200 MB beyond what the process has, without a loop over what isn't there."""
-    with limited(200 << 20), pytest.raises(ValueError, match=r"."):
-        read_mesh(BOMBS[what])
+    with limit_memory(200 << 20), pytest.raises(ValueError, match=r"."):
+        read_mesh(BOMBS[case])
 
 
 def test_arrays_that_are_not_needed_are_not_expanded() -> None:
-    named = '<DataArray type="Float64" Name="{}" NumberOfComponents="3" format="binary">{}</DataArray>'
-    u = packed(zlib.compress(np.arange(12.0).astype("<f8").tobytes()), size=96)
-    with limited(200 << 20):
+    template = '<DataArray type="Float64" Name="{}" NumberOfComponents="3" format="binary">{}</DataArray>'
+    u = pack_blocks(zlib.compress(np.arange(12.0).astype("<f8").tobytes()), size=96)
+    with limit_memory(200 << 20):
         mesh = read_mesh(
-            compressed(POINTS, 4, named.format("u", u) + named.format("x", packed(HUGE, size=96)))
+            build_vtu(POINTS, 4, template.format("u", u) + template.format("x", pack_blocks(HUGE, size=96)))
         )
         np.testing.assert_array_equal(mesh.point_data["u"].read(), np.arange(12.0).reshape(4, 3))
         with pytest.raises(ValueError, match=r"another size|expands"):
@@ -505,19 +512,19 @@ def test_polygons_and_strips_become_triangles_that_face_alike(strips: bool) -> N
     mesh = read_mesh(f"{data}{kind} {2 - strips} {size}\n{rows}".encode())
     a, b, c = (mesh.points[mesh.cells[5][:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)[:, 2] / 2
-    assert len({bool(one > 0) for one in normals}) == 1
-    whole = 2.0 if strips else 1.5 * np.sqrt(3) + 0.75 * np.sqrt(3)
-    assert np.abs(normals).sum() == pytest.approx(whole)
+    assert len({bool(normal > 0) for normal in normals}) == 1
+    area = 2.0 if strips else 1.5 * np.sqrt(3) + 0.75 * np.sqrt(3)
+    assert np.abs(normals).sum() == pytest.approx(area)
 
 
 @pytest.mark.parametrize("kind", SURFACES)
 def test_surfaces_that_move_are_read_in_their_order(kind: str, tmp_path: Path) -> None:
     """As OBJ with groups, materials (which are not opened) and textures, PLY and GLB, written by trimesh."""
     block = solve()
-    used, faces = np.unique(skin(block.points, {10: block.tets}), return_inverse=True)
+    nodes, faces = np.unique(skin(block.points, {10: block.tets}), return_inverse=True)
     for k in range(STATES):
         mesh = trimesh.Trimesh(
-            block.points[used] + block.scale[k] * block.u[used], faces.reshape(-1, 3), process=False
+            block.points[nodes] + block.scale[k] * block.u[nodes], faces.reshape(-1, 3), process=False
         )
         data = mesh.export(file_type=kind)
         data = data.encode() if isinstance(data, str) else data
@@ -534,9 +541,11 @@ def test_surfaces_that_move_are_read_in_their_order(kind: str, tmp_path: Path) -
         (tmp_path / f"s_{k}.{kind}").write_bytes(data)
     os.mkfifo(tmp_path / "m.mtl")
     series = read_series(tmp_path / f"s_*.{kind}", Units(1.0, dt_s=STEP_S))
-    order, true = (np.lexsort(one.round(3).T) for one in (series.points, block.points[used]))
-    np.testing.assert_allclose(series.points[order], block.points[used][true], atol=1e-5)
-    np.testing.assert_allclose(series.displacement[2][order], block.u[used][true], atol=1e-5)
+    series_order, block_order = (
+        np.lexsort(points.round(3).T) for points in (series.points, block.points[nodes])
+    )
+    np.testing.assert_allclose(series.points[series_order], block.points[nodes][block_order], atol=1e-5)
+    np.testing.assert_allclose(series.displacement[2][series_order], block.u[nodes][block_order], atol=1e-5)
 
 
 HOSTILE_SURFACES = {
@@ -549,10 +558,10 @@ HOSTILE_SURFACES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", HOSTILE_SURFACES)
-def test_a_surface_that_would_take_long_is_refused(what: str) -> None:
-    kind, data = HOSTILE_SURFACES[what]
-    with limited(200 << 20), pytest.raises(ValueError, match=r"."):
+@pytest.mark.parametrize("case", HOSTILE_SURFACES)
+def test_a_surface_that_would_take_long_is_refused(case: str) -> None:
+    kind, data = HOSTILE_SURFACES[case]
+    with limit_memory(200 << 20), pytest.raises(ValueError, match=r"."):
         read_surface(data, kind)
 
 
@@ -562,13 +571,13 @@ def test_a_table_lies_in_the_folder_of_the_files(name: str, tmp_path: Path) -> N
     (tmp_path / "f.csv").write_text(TABLE)
     (tmp_path / "in/link.csv").symlink_to(tmp_path / "f.csv")
     os.mkfifo(tmp_path / "in/pipe.csv")
-    for given in ({"force": name.format(tmp_path)}, {"force": FORCE, "instruments": name.format(tmp_path)}):
+    for tables in ({"force": name.format(tmp_path)}, {"force": FORCE, "instruments": name.format(tmp_path)}):
         with pytest.raises(UserError, match=r"folder|regular"):
-            read_series(source, Units(1.0, 1.0, STEP_S), **given)
+            read_series(source, Units(1.0, 1.0, STEP_S), **tables)
 
 
 @pytest.mark.parametrize(
-    ("table", "named"),
+    ("table", "pattern"),
     [
         ("time,fx,fy,fz\n0,0,0,0\n1,1,0,0\n", "x, y, z"),
         (TABLE.replace("\n0.5", "\n0.1"), "rise"),
@@ -578,10 +587,10 @@ def test_a_table_lies_in_the_folder_of_the_files(name: str, tmp_path: Path) -> N
         (TABLE.replace("-4", ""), "missing"),
     ],
 )
-def test_a_bad_table_is_refused_by_name(table: str, named: str, tmp_path: Path) -> None:
+def test_a_bad_table_is_refused_by_name(table: str, pattern: str, tmp_path: Path) -> None:
     source = write(tmp_path, "ascii")
     (tmp_path / "force.csv").write_text(table)
-    with pytest.raises(UserError, match=rf"force\.csv.*{named}"):
+    with pytest.raises(UserError, match=rf"force\.csv.*{pattern}"):
         read(source, force="force.csv")
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from synth.flow.recording.decode import Footage, RecordingFlowSettings
-from synth.flow.recording.find_tissue import TissueSearch, touches_border
+from synth.flow.recording.find_tissue import TissueSearch, measure_border_share
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame
 from synth.flow.recording.video_track import track_video
 from synth.video.read_video import Picture
@@ -22,14 +22,14 @@ def video(opening: NDArray[np.bool_], rim: NDArray[np.float64], px: float, bump:
     rng = np.random.default_rng(0)
     pull = rim * np.minimum(1, 10 / np.maximum(np.hypot(X - 70, Y - 60), 1e-6))
 
-    def picture(frame: int) -> Picture:
+    def draw_picture(frame: int) -> Picture:
         drag = px * np.sin(np.pi * frame / 8) ** 2 * pull
         rgb = texture(X - drag, Y) * np.array([1.0, 0.7, 0.6])
         rgb[~opening] = (texture(Y, X) * np.array([0.6, 0.8, 1.0]))[~opening]
         rgb = np.roll(rgb, bump * (frame > 5), axis=0) + rng.normal(0, 1, rgb.shape)
         return Picture(frame, frame / 8, np.clip(rgb, 0, 255).astype(np.uint8))
 
-    return Footage(partial(map, picture, range(12)), "video")
+    return Footage(partial(map, draw_picture, range(12)), "video")
 
 
 CASES = {
@@ -43,45 +43,46 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_tissue_is_found(case: str) -> None:
-    last = track_video(video(*CASES[case]), SETTINGS).video
+    video_pass = track_video(video(*CASES[case]), SETTINGS).video
     truth, severity = CASES[case][0], "warning" if case == "gentle contact" else "missing"
-    tissue = last.rest.tissue
+    tissue = video_pass.rest.tissue
     assert (tissue & truth).sum() / (tissue | truth).sum() > 0.9
-    assert [one.severity for one in last.rest.findings] == [severity]
-    assert last.rest.findings[0].cause == "tissue"
+    assert [finding.severity for finding in video_pass.rest.findings] == [severity]
+    assert video_pass.rest.findings[0].cause == "tissue"
 
 
 def test_a_blob_is_held_back() -> None:
     """What alone moves is a small disc, as an instrument is: no force is stated on it."""
     disc = np.hypot(X - 70, Y - 60) < 16
-    last = track_video(video(disc, disc.astype(float), 4, 0), SETTINGS).video
-    assert last.rest.tissue.mean() < 0.05
-    assert [one.severity for one in last.rest.findings] == ["error"]
-    assert "tissue.png" in last.rest.findings[0].message
+    video_pass = track_video(video(disc, disc.astype(float), 4, 0), SETTINGS).video
+    assert video_pass.rest.tissue.mean() < 0.05
+    assert [finding.severity for finding in video_pass.rest.findings] == ["error"]
+    assert "tissue.png" in video_pass.rest.findings[0].message
 
 
 def test_a_part_that_an_instrument_cuts_off_and_often_hides_belongs_to_the_tissue() -> None:
     rng = np.random.default_rng(0)
     rgb = texture(X, Y) * np.array([1.0, 0.7, 0.6])
     rgb[~OPENING] = (texture(Y, X) * np.array([0.6, 0.8, 1.0]))[~OPENING]
-    blade = (X > 72) & (X < 86) & (Y < 120)
+    blade = (X > 72) & (X < 86)
     rgb[blade] = 150
     picture = np.clip(rgb + rng.normal(0, 1, rgb.shape), 0, 255).astype(np.uint8)
     search = TissueSearch(RestFrame(picture, EVERYWHERE, X.shape, 1, 0.0, ""))
-    still = np.zeros((*X.shape, 2), np.float32)
-    sure = np.where(blade, 0, 0.99).astype(np.float32)
-    search.add(FrameMotion(still, sure, is_rest=True, masked=blade))
+    zero_flow = np.zeros((*X.shape, 2), np.float32)
+    confidence = np.where(blade, 0, 0.99).astype(np.float32)
+    search.add(FrameMotion(zero_flow, confidence, is_rest=True, masked=blade))
     for frame in range(10):
         flow = np.stack([3 * (frame + 1) / 10 * RIM + 0.3 * OPENING, 0 * RIM], -1).astype(np.float32)
-        left = OPENING & (X <= 72)
-        known = np.where(left & (frame % 2 == 0), 0.1, sure).astype(np.float32)  # lost in every other frame
-        search.add(FrameMotion(flow, known, masked=blade))
+        left_side = OPENING & (X <= 72)
+        # Lost in every other frame.
+        frame_confidence = np.where(left_side & (frame % 2 == 0), 0.1, confidence).astype(np.float32)
+        search.add(FrameMotion(flow, frame_confidence, masked=blade))
     tissue, finding = search.find()
     assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.85
     assert finding.severity == "missing"
 
 
 def test_the_border_of_the_picture_is_no_edge() -> None:
-    assert touches_border(EVERYWHERE) == 1
-    assert touches_border(OPENING) == 0
-    assert touches_border(X < 80) == pytest.approx(278 / 396)
+    assert measure_border_share(EVERYWHERE) == 1
+    assert measure_border_share(OPENING) == 0
+    assert measure_border_share(X < 80) == pytest.approx(278 / 396)

@@ -21,19 +21,19 @@ from synth.video.read_video import Picture
 @pytest.mark.slow
 def test_errors_and_the_end_of_the_process_are_reported() -> None:
     rest = texture(64, 80)
-    moved, free = np.roll(rest, 2, axis=1), np.zeros((64, 80), bool)
-    with closing(FlowProcess()) as elsewhere:
+    shifted_picture, empty_mask = np.roll(rest, 2, axis=1), np.zeros((64, 80), bool)
+    with closing(FlowProcess()) as process:
         with pytest.raises(UserError, match="no estimator"):
-            elsewhere.begin("nonesuch", rest, free, ~free)
-        elsewhere.begin("dis", rest, free, ~free)
+            process.begin("nonesuch", rest, empty_mask, ~empty_mask)
+        process.begin("dis", rest, empty_mask, ~empty_mask)
         with pytest.raises(UserError, match="does not fit"):
-            elsewhere.submit(moved[:-1], free).result()
-        worker = elsewhere._pool.submit(os.getpid).result()
+            process.submit(shifted_picture[:-1], empty_mask).result()
+        worker = process._pool.submit(os.getpid).result()
         os.kill(worker, signal.SIGINT)  # Ctrl-C in a terminal reaches every process; it must not end this one
-        assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
-        pictures = [Picture(k, k / 25, one) for k, one in enumerate((rest, moved))]
+        assert np.abs(process.submit(shifted_picture, empty_mask).result().flow).max() > 1
+        pictures = [Picture(k, k / 25, rgb) for k, rgb in enumerate((rest, shifted_picture))]
         settings = RecordingFlowSettings("dis", 1, None, masks="none")
-        frames = VideoPass(Footage(lambda: pictures, "video"), settings, flow=elsewhere).frames()
+        frames = VideoPass(Footage(lambda: pictures, "video"), settings, flow=process).frames()
         assert next(frames).is_rest
         os.kill(worker, signal.SIGKILL)
         with pytest.raises(UserError, match="ended"):
