@@ -8,7 +8,7 @@ from synth.errors import UserError
 
 STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
-MOTION = 7
+MOTION = 8
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
 MESH, CONTENT, COMPLIANCE, CLIPS, TRAINING, SCORING = 1, 8, 1, 1, 2, 6

@@ -10,9 +10,11 @@ accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
 rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h,
 that is, smoothed quadratically. On the finest level grad is of w less its local mean. lambda is scaled by
-(reference / median residual)^2, limited to 0.45-1.5, and rises where the initial flow is steep. The solver
-works coarse to fine with repeated warping (Brox); each warp is solved by the primal-dual algorithm 1 of
-Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) with lagged weights.
+(reference / median residual)^2, limited to 0.45-1.5, and rises where the initial flow is steep. Only on the
+finest level: on coarse ones noise has averaged out, and what residual there is, is motion not yet found,
+which a smaller lambda would never find. The solver works coarse to fine with repeated warping (Brox); each
+warp is solved by the primal-dual algorithm 1 of Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) with
+lagged weights.
 """
 
 from __future__ import annotations
@@ -47,9 +49,13 @@ class TVL1Settings:
     hidden_huber: float = 0.3  # added to h where nothing is visible: the flow has no steps there
     epsilon: float = 0.01  # residuals below it count quadratically [local std]
     coarsest_px: int = 12  # shorter side of the coarsest level, about
-    warps: int = 4  # linearisations per level
-    steps: int = 24  # primal-dual steps per warp
-    settled_px: float = 0.01  # RMS change of the visible by a warp that ends a level [px of the level]
+    warps: int = 8  # linearisations of the finest level
+    steps: int = 16  # primal-dual steps per warp there
+    settled_px: float = 0.005  # RMS change of the visible by a warp that ends it
+    coarse_weight: float = 1.4  # factor of lambda on coarse levels
+    coarse_warps: int = 4  # linearisations per coarse level
+    coarse_steps: int = 24  # primal-dual steps per warp there
+    coarse_settled_px: float = 0.01  # RMS change of the visible by a warp that ends one [px of the level]
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
     bending_px: float = (
@@ -62,13 +68,22 @@ class TVL1Settings:
     fine_levels: int = 2  # levels of the second stage
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
-    coarse_tau: float = 1.0  # primal step of the first stage: small, because coarse levels may diverge
-    coarse_warps: int = 4  # linearisations per level of the first stage, which omits the finest level
+    first_tau: float = 1.0  # primal step of the first stage: small, because coarse levels may diverge
 
     def first_stage(self, weight: float) -> TVL1Settings:
-        """Settings of the first stage of a cold start."""
-        tau, warps = self.coarse_tau, self.coarse_warps
-        return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, bending_px=0.0, tau=tau, warps=warps)
+        """Settings of the first stage of a cold start, which omits the finest level."""
+        return replace(self, weight=weight, hidden_huber=0.0, tau=self.first_tau, coarse_weight=1.0)
+
+    def coarse(self) -> TVL1Settings:
+        """Settings of all levels but the finest."""
+        return replace(
+            self,
+            noise=0.0,
+            bending_px=0.0,
+            warps=self.coarse_warps,
+            steps=self.coarse_steps,
+            settled_px=self.coarse_settled_px,
+        )
 
 
 class Tvl1:
@@ -136,23 +151,27 @@ def pyramid(grey: Map, usable: Map, s: TVL1Settings) -> list[tuple[Map, Map]]:
 
 
 def guess(levels: list[Level], s: TVL1Settings) -> Map:
-    """The first stage of a cold start with two values of lambda; returns the better flow (2, H, W) px.
+    """The first stage of a cold start, all levels but the finest, with two values of lambda; returns the
+    better flow (2, H, W) px.
 
     A large lambda follows large motion but fails on small areas between forceps tips; a small one does the
     opposite.
     """
     weights = s.small_motion_weight, s.large_motion_weight
-    small, large = (solve(levels, None, s.first_stage(weight)) for weight in weights)
+    small, large = (solve(levels, None, s.first_stage(weight), skipped=1) for weight in weights)
     warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
     trust = [float(confidence.agreement(levels[0], *pictures).mean()) for pictures in warped]
     return large if trust[1] > _BETTER * trust[0] else small
 
 
-def solve(levels: list[Level], initial: Map | None, s: TVL1Settings) -> Map:
-    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
-    finest = levels[0].now.shape
-    flow = np.zeros((2, *finest), np.float32) if initial is None else initial
-    return _refine(levels, _pyramid(flow, len(levels))[-1], _weights(finest, initial, s), s)
+def solve(levels: list[Level], initial: Map | None, s: TVL1Settings, skipped: int = 0) -> Map:
+    """Flow (2, H, W) px of the first of the levels, which are from fine to coarse.
+
+    `initial`: as the result; `skipped`: how many finer levels there are.
+    """
+    shape = levels[0].now.shape
+    flow = np.zeros((2, *shape), np.float32) if initial is None else initial
+    return _refine(levels, _pyramid(flow, len(levels))[-1], _weights(shape, initial, s), s, skipped=skipped)
 
 
 def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
@@ -166,9 +185,10 @@ def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
     if len(levels) <= _FINE or np.hypot(*last).max() <= s.large_px:
         return solve(levels, last, s)
     weight, start = _weights(last.shape[1:], last, s), _pyramid(last, len(levels))
-    coarse, all_smooth = levels[_FINE:], replace(s, bending_px=0.0)
+    coarse = levels[_FINE:]
     flows = [
-        _refine(coarse, start[-1], weight, all_smooth, references) for references in (None, start[_FINE:])
+        _refine(coarse, start[-1], weight, s, references, skipped=_FINE)
+        for references in (None, start[_FINE:])
     ]
     warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in flows]
     trust = [confidence.agreement(coarse[0], *pictures) for pictures in warped]
@@ -194,22 +214,30 @@ def _pyramid(flow: Map, count: int) -> list[Map]:
 
 
 def _refine(
-    levels: list[Level], flow: Map, weight: Map, s: TVL1Settings, references: list[Map] | None = None
+    levels: list[Level],
+    flow: Map,
+    weight: Map,
+    s: TVL1Settings,
+    references: list[Map] | None = None,
+    skipped: int = 0,
 ) -> Map:
-    """Flow of the finest level from that of the coarsest; `references`: on each level, see `_solve_level`."""
+    """Flow of the first of the levels from that of the last, the coarsest; `references`: on each level, see
+    `_solve_level`; `skipped`: as of `solve`."""
     for k in reversed(range(len(levels))):
         shape = levels[k].now.shape
         if flow.shape[1:] != shape:
             flow = upsample(flow, levels[k])
         level_weight = image.resize(weight[None], shape)[0]
         reference = None if references is None else references[k]
-        flow = _solve_level(levels[k], flow, level_weight, s, reference, 0.0 if k else s.bending_px)
+        if k + skipped == 0:
+            flow = _solve_level(levels[k], flow, level_weight, s, reference)
+        else:
+            level_weight = np.float32(s.coarse_weight) * level_weight
+            flow = _solve_level(levels[k], flow, level_weight, s.coarse(), reference)
     return flow
 
 
-def _solve_level(
-    level: Level, flow: Map, weight: Map, s: TVL1Settings, reference: Map | None, bending_px: float
-) -> Map:
+def _solve_level(level: Level, flow: Map, weight: Map, s: TVL1Settings, reference: Map | None) -> Map:
     """All warps of a level: each linearises r about the flow, weights it and minimises the energy.
 
     The smoothness term sees the flow less `reference` (2, H, W), or less its Gaussian mean: of all of it, it
@@ -240,8 +268,8 @@ def _solve_level(
             share = noise_weight(before, after, mask, s.gradient, s.noise)
             scaled_weight = weight * np.float32(np.clip(share, *_WEIGHT_LIMITS))
         last, mean = solution, _ZERO if reference is None else reference
-        if bending_px > 0:
-            mean = image.double(image.window(last, bending_px), rest.shape)
+        if s.bending_px > 0:
+            mean = image.double(image.window(last, s.bending_px), rest.shape)
         solution = last - mean
         linearise(before, after, mask, scaled_weight, solution, numbers, state)
         primal_dual(solution, state, np.float32(s.tau), s.steps)
