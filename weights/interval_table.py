@@ -114,16 +114,21 @@ def intervals(
     count: int = 4,
     makes: str = ",".join(MAKES),
     only_fit: Annotated[bool, typer.Option("--only-fit", help="Use the scores that WORK has.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Keep the table, for today's motion.")] = False,
 ) -> None:
-    """Calibrates the interval of the force and writes its table into the package."""
+    """Calibrates the interval of the force and writes its table into the package.
+
+    With `check` the table is not fitted again but judged on these recordings, whose motion it then is for.
+    """
     if not only_fit:
         for folder, make, stated in _recordings(work, foreign, count, makes.split(",")):
             for is_full, cameras in product((True, False), (2, 1)):
                 _score(work, folder, make, stated if is_full else None, cameras)
-    table = fit_table(read_examples(work / "scores"))
+    examples = read_examples(work / "scores")
+    table = check_table(force_interval.read_table(), examples) if check else fit_table(examples)
     text = json.dumps(asdict(table), indent=1, allow_nan=False)
     write_whole(force_interval.TABLE, text + "\n", durable=False)
-    for name, row in table.reached.items():
+    for name, row in (table.checked or table.reached).items():
         print(name, {key: round(value, 3) for key, value in row.items()})
 
 
@@ -233,18 +238,32 @@ def fit_table(examples: Sequence[Example]) -> IntervalTable:
     table = _fit(examples)
     crossed = {make: _fit([e for e in examples if e.make != make]) for make in table.makes}
     rows = {id(example): _judge(example, crossed[example.make]) for example in examples}
+    return replace(table, stating=_find_gains(examples, rows), reached=_pool_groups(examples, rows))
 
-    def pool(subset: Sequence[Example]) -> dict[str, float]:
-        return _pool(subset, [rows[id(example)] for example in subset])
 
-    reached = {}
+def check_table(table: IntervalTable, examples: Sequence[Example]) -> IntervalTable:
+    """A table for today's motion, with what it holds on examples of that on which it was not fitted."""
+    rows = {id(example): _judge(example, table) for example in examples}
+    flow = name_motion(RecordingFlowSettings().backend)
+    return replace(table, flow=flow, checked=_pool_groups(examples, rows))
+
+
+def _pool_groups(
+    examples: Sequence[Example], rows: Mapping[int, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """`_pool` by cameras and statements, by make, and of all examples."""
+    groups: dict[str, list[Example]] = {}
     for cameras, is_stated in product((2, 1), (True, False)):
-        subset = [e for e in examples if e.video.cameras == cameras and (e.video.stated > 0) is is_stated]
-        if subset:
-            reached[f"{cameras} cameras, {'much' if is_stated else 'little'} stated"] = pool(subset)
-    reached |= {make: pool([e for e in examples if e.make == make]) for make in table.makes}
-    reached["all"] = pool(examples)
-    return replace(table, stating=_find_gains(examples, rows), reached=reached)
+        name = f"{cameras} cameras, {'much' if is_stated else 'little'} stated"
+        groups[name] = [e for e in examples if (e.video.cameras, e.video.stated > 0) == (cameras, is_stated)]
+    for make in sorted({example.make for example in examples}):
+        groups[make] = [example for example in examples if example.make == make]
+    groups["all"] = [*examples]
+    return {
+        name: _pool(group, [rows[id(example)] for example in group])
+        for name, group in groups.items()
+        if group
+    }
 
 
 def _fit(examples: Sequence[Example]) -> IntervalTable:

@@ -29,9 +29,9 @@ _SHAPE = 0.05  # mean error of a right estimate's curve over its peak, gain asid
 _STRAIGHT, _ASKEW = 0.5, 0.9
 _DIRECTION_ERROR = 0.4  # mean error of a right estimate's components over its force
 _MAX_GAIN = 2.0  # factor between sensor and force that no method errs by; the worst scenes of ours reach 1.7
-_SURE_ODDS = np.log(20.0)  # log odds from which a hypothesis is named
-_LIKELY_ODDS = np.log(3.0)  # the same where the interval fails, so that there is a fault
-_RIVAL_ODDS = np.log(10.0)  # log odds within which others are named next to the best
+_SURE_LOG_ODDS = np.log(20.0)  # log odds from which a hypothesis is named
+_LIKELY_LOG_ODDS = np.log(3.0)  # the same where the interval fails, so that there is a fault
+_RIVAL_LOG_ODDS = np.log(10.0)  # log odds within which others are named next to the best
 _MOST_RESIDUAL = 0.5  # share of the force's mean deviation that a hypothesis may leave
 _SIDEWAYS = 0.2  # least share of the force in the observed axes
 _UNITS = {1000.0: "mN for N, or Pa or MPa for kPa", 102.0: "grams", 100.0: "cm for mm"}
@@ -74,7 +74,7 @@ class Hypothesis:
 @dataclass(frozen=True)
 class _Verdict:
     hypothesis: Hypothesis
-    odds: float  # log odds against the recording as it is
+    log_odds: float  # against the recording as it is
     explains: bool  # whether little of the force is left unexplained
     gain: float  # of the sensor
 
@@ -159,17 +159,19 @@ def _edges(time_s: Floats, curve: Floats) -> Floats:
 def _check_hypotheses(sensor: SensorMotion) -> list[Finding]:
     """The finding on the likeliest causes of a contradiction, if there is one."""
     force, gains = _estimate(sensor)
-    verdicts = sorted(_judge(sensor, force, gains), key=lambda verdict: -verdict.odds)
+    verdicts = sorted(_judge(sensor, force, gains), key=lambda verdict: -verdict.log_odds)
     shortfall = find_missed(sensor)
-    least_odds = _LIKELY_ODDS if shortfall else _SURE_ODDS
-    candidates = [verdict for verdict in verdicts if verdict.explains and verdict.odds > least_odds]
+    least_log_odds = _LIKELY_LOG_ODDS if shortfall else _SURE_LOG_ODDS
+    candidates = [verdict for verdict in verdicts if verdict.explains and verdict.log_odds > least_log_odds]
     if shortfall and not candidates:  # by little: what is left is a gain, if the curves are alike
         candidates = [verdict for verdict in verdicts if verdict.explains and verdict.hypothesis.any_gain]
     if not candidates:
         cause = "no cause was found among gain, axes, rest frame and clocks"
         return [Finding("warning", "interval", f"{shortfall}; {cause}")] if shortfall else []
     best = candidates[0]
-    rivals = [verdict.hypothesis for verdict in candidates if verdict.odds > best.odds - _RIVAL_ODDS]
+    rivals = [
+        verdict.hypothesis for verdict in candidates if verdict.log_odds > best.log_odds - _RIVAL_LOG_ODDS
+    ]
     messages = dict[str, str]()  # the best of each cause
     for hypothesis in rivals:
         cause = hypothesis.message.split(":")[0] if hypothesis.turns else hypothesis.cause
@@ -178,7 +180,7 @@ def _check_hypotheses(sensor: SensorMotion) -> list[Finding]:
     # Only what several estimates agree on is certain: one may be wrong itself.
     is_certain = (
         shortfall
-        and best.odds > _SURE_ODDS
+        and best.log_odds > _SURE_LOG_ODDS
         and all(_agrees(sensor, force_mn, best) for force_mn in sensor.forces_mn)
     )
     is_certain = is_certain and (len(sensor.forces_mn) > 1 or _is_shown_by_motion(sensor, best))
@@ -273,13 +275,13 @@ def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> I
                 for axes in (sensor.axes_mn, hypothesis.axes_mn)
             ]
             explains &= shares[0] > _ASKEW and shares[1] < _STRAIGHT
-        odds = count * inside.mean() * float(np.log(before / after).sum()) - np.log(hypothesis.tried)
+        log_odds = count * inside.mean() * float(np.log(before / after).sum()) - np.log(hypothesis.tried)
         if hypothesis.any_gain:
             explains &= not 1 / _MAX_GAIN < free_gain / base_gain < _MAX_GAIN or bool(
                 gains[0] > free_gain or free_gain > gains[1]
             )
             hypothesis = _name_gain(hypothesis, gain)
-        yield _Verdict(hypothesis, odds, bool(explains), gain)
+        yield _Verdict(hypothesis, log_odds, bool(explains), gain)
 
 
 def _direction_error(force: Floats, sensor_mn: Floats) -> float:
@@ -315,7 +317,7 @@ def _is_shown_by_motion(sensor: SensorMotion, best: _Verdict) -> bool:
 def _has_cause(verdicts: Iterable[_Verdict], best: _Verdict) -> bool:
     """Whether one of the judged hypotheses of the best one's cause is sure and explains the force."""
     rivals = (verdict for verdict in verdicts if verdict.hypothesis.cause == best.hypothesis.cause)
-    return any(verdict.odds > _SURE_ODDS and verdict.explains for verdict in rivals)
+    return any(verdict.log_odds > _SURE_LOG_ODDS and verdict.explains for verdict in rivals)
 
 
 def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -87,11 +87,16 @@ class IntervalTable:
     features: tuple[str, ...]
     by_cameras: dict[int, CameraModel]
     makes: dict[str, int]  # recordings of each make
-    flow: str  # estimator of their motion and its version, as of `name_motion`
+    flow: str
+    """Estimator and version of the motion that it is for, as of `name_motion`: that of its recordings, or a
+    later one on which it was checked."""
     stating: dict[str, Positive]
     """Mean width of the intervals with what a recording may state over that without it."""
     reached: dict[str, dict[str, FiniteFloat]]
     """Counts, holds and widths by cross-validation: each make is calibrated without its recordings."""
+    checked: dict[str, dict[str, FiniteFloat]] = field(default_factory=dict)
+    """The same of new recordings, with motion by `flow`, on which it was checked; empty: it was fitted on
+    that motion."""
 
     def bound(self, video: VideoEstimates, gain: float) -> tuple[Floats, Floats]:
         """Lower and upper ends (T,) mN. `gain`: relative standard deviation of every force, from E."""

@@ -1,6 +1,6 @@
 """How near a set of crops is to another one: kernel distance, coverage, and lengths of vessels by calibre.
 
-Distances are those of features (`classifier.embedded`); lengths are of ridges, as a filter finds them in both
+Distances are those of features (`classifier.embed`); lengths are of ridges, as a filter finds them in both
 a photograph and a rendering at the same scale, so that their ratio is meaningful, not their size.
 """
 

@@ -36,18 +36,19 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     """(family, setting, estimator, share of the true flow to start from)."""
     s = TVL1Settings()
     variants = {
-        "warps 2": replace(s, warps=2),
+        "warps 2": replace(s, warps=2, coarse_warps=2),
+        "warps 4": replace(s, warps=4),
         "cold (default)": s,
-        "warps 6, steps 16": replace(s, warps=6, steps=16, coarse_warps=6),
+        "warps 16": replace(s, warps=16),
         "no gradient": replace(s, gradient=0.0),
         "no median": replace(s, median=False),
         "Huber 0.03": replace(s, huber=0.03),
         "lambda / 3": replace(s, weight=s.weight / 3),
         "lambda x 3": replace(s, weight=3 * s.weight),
-        "one lambda": replace(s, noise=0.0, steep=0.0),
+        "one lambda": replace(s, noise=0.0, steep=0.0, coarse_weight=1.0),
         "no membrane": replace(s, hidden_huber=0.0),
     }
-    warm = {"warm 2 warps": replace(s, warps=2), "warm (default)": s}
+    warm = {"warm 2 warps": replace(s, warps=2, coarse_warps=2), "warm (default)": s}
     opencv_variants = {
         f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)
     }

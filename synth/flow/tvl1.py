@@ -9,10 +9,10 @@ psi(s^2) = sqrt(s^2 + epsilon^2) is the robust data term on brightness and gradi
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
 rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h,
-that is, smoothed quadratically. On the finest level grad is of w less its local mean. lambda is scaled by
-(reference / median residual)^2, limited to 0.45-1.5, and rises where the initial flow is steep. Only on the
-finest level: on coarse ones noise has averaged out, and what residual there is, is motion not yet found,
-which a smaller lambda would never find. The solver works coarse to fine with repeated warping (Brox); each
+that is, smoothed quadratically. On the finest level grad is of w less its local mean. lambda rises where the
+initial flow is steep. On the finest level it is scaled by (reference / median residual)^2, limited to
+0.45-1.5; on coarse ones, where noise has averaged out and a residual is motion not yet found, which a smaller
+lambda would never find, by a constant. The solver works coarse to fine with repeated warping (Brox); each
 warp is solved by the primal-dual algorithm 1 of Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) with
 lagged weights.
 """
@@ -43,7 +43,7 @@ class TVL1Settings:
     with two values of lambda, then the solution on the fine levels. A warm start solves on all levels."""
 
     weight: float = 0.18  # lambda: data against smoothness
-    noise: float = 0.115  # reference median residual [local standard deviations]; 0: lambda is constant
+    noise: float = 0.115  # finest level: reference median residual [local standard deviations]; 0: no scaling
     gradient: float = 1.0  # gamma: weight of gradient constancy
     huber: float = 0.15  # h [px/px]: smaller flow gradients are smoothed quadratically, larger ones linearly
     hidden_huber: float = 0.3  # added to h where nothing is visible: the flow has no steps there
@@ -51,7 +51,7 @@ class TVL1Settings:
     coarsest_px: int = 12  # shorter side of the coarsest level, about
     warps: int = 8  # linearisations of the finest level
     steps: int = 16  # primal-dual steps per warp there
-    settled_px: float = 0.005  # RMS change of the visible by a warp that ends it
+    settled_px: float = 0.005  # RMS change of the visible by a warp that ends it [px]
     coarse_weight: float = 1.4  # factor of lambda on coarse levels
     coarse_warps: int = 4  # linearisations per coarse level
     coarse_steps: int = 24  # primal-dual steps per warp there
@@ -63,18 +63,18 @@ class TVL1Settings:
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
-    better: float = 0.1  # see `follow`: change of agreement over which it turns
+    agreement_range: float = 0.1  # see `follow`: change of agreement over which it turns
     large_px: float = 2.0  # there: length from which motion is large
-    fine_levels: int = 2  # levels of the second stage
+    second_stage_levels: int = 2  # the finest
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
-    first_tau: float = 1.0  # primal step of the first stage: small, because coarse levels may diverge
+    first_tau: float = 1.0  # primal step of the first stage: small, as from no flow coarse levels may diverge
 
-    def first_stage(self, weight: float) -> TVL1Settings:
+    def derive_first_stage(self, weight: float) -> TVL1Settings:
         """Settings of the first stage of a cold start, which omits the finest level."""
         return replace(self, weight=weight, hidden_huber=0.0, tau=self.first_tau, coarse_weight=1.0)
 
-    def coarse(self) -> TVL1Settings:
+    def derive_coarse(self) -> TVL1Settings:
         """Settings of all levels but the finest."""
         return replace(
             self,
@@ -131,7 +131,7 @@ class Tvl1:
         if initial is not None:
             flow = follow(levels, initial, s)
         elif len(levels) > 1:
-            flow = solve(levels[: s.fine_levels], upsample(guess(levels[1:], s), levels[0]), s)
+            flow = solve(levels[: s.second_stage_levels], upsample(guess(levels, s), levels[0]), s)
         else:
             flow = solve(levels, None, s)
         flow = smooth_noise(flow, s.steady_px)
@@ -151,16 +151,17 @@ def pyramid(grey: Map, usable: Map, s: TVL1Settings) -> list[tuple[Map, Map]]:
 
 
 def guess(levels: list[Level], s: TVL1Settings) -> Map:
-    """The first stage of a cold start, all levels but the finest, with two values of lambda; returns the
-    better flow (2, H, W) px.
+    """The first stage of a cold start, on all levels but the finest, with two values of lambda; returns the
+    better flow (2, h, w) px of the second level.
 
     A large lambda follows large motion but fails on small areas between forceps tips; a small one does the
     opposite.
     """
     weights = s.small_motion_weight, s.large_motion_weight
-    small, large = (solve(levels, None, s.first_stage(weight), skipped=1) for weight in weights)
-    warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
-    trust = [float(confidence.agreement(levels[0], *pictures).mean()) for pictures in warped]
+    coarse = levels[1:]
+    small, large = (solve(coarse, None, s.derive_first_stage(weight), skipped=1) for weight in weights)
+    warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in (small, large)]
+    trust = [float(confidence.agreement(coarse[0], *pictures).mean()) for pictures in warped]
     return large if trust[1] > _BETTER * trust[0] else small
 
 
@@ -192,7 +193,7 @@ def follow(levels: list[Level], last: Map, s: TVL1Settings) -> Map:
     ]
     warped = [image.warp(coarse[0].now, coarse[0].now_usable, flow) for flow in flows]
     trust = [confidence.agreement(coarse[0], *pictures) for pictures in warped]
-    share = np.clip(_HALF + (trust[1] - trust[0]) / np.float32(s.better), 0, 1)
+    share = np.clip(_HALF + (trust[1] - trust[0]) / np.float32(s.agreement_range), 0, 1)
     flow = upsample(flows[0] + share * (flows[1] - flows[0]), levels[_FINE - 1])
     return _refine(levels[:_FINE], flow, weight, s)
 
@@ -233,7 +234,7 @@ def _refine(
             flow = _solve_level(levels[k], flow, level_weight, s, reference)
         else:
             level_weight = np.float32(s.coarse_weight) * level_weight
-            flow = _solve_level(levels[k], flow, level_weight, s.coarse(), reference)
+            flow = _solve_level(levels[k], flow, level_weight, s.derive_coarse(), reference)
     return flow
 
 

@@ -291,9 +291,9 @@ class FemSection(Section):
 
     @model_validator(mode="after")
     def _contacts_are_loaded_or_driven(self) -> FemSection:
-        labelled = [(f"instrument_list[{k}].", line) for k, line in enumerate(self.instrument_list)]
+        labelled = [(f"instrument_list[{k}].", section) for k, section in enumerate(self.instrument_list)]
         if "driven" not in self.contact:
-            travels = [("", self.travel_mm), *((label, line.travel_mm) for label, line in labelled)]
+            travels = [("", self.travel_mm), *((label, section.travel_mm) for label, section in labelled)]
             for label, travel_mm in travels:
                 if travel_mm is not None:
                     raise ValueError(f"{label}travel_mm needs contact: driven")
@@ -304,8 +304,8 @@ class FemSection(Section):
         has_both = "loaded" in self.contact
         if slides and (not has_both or {*self.gestures} == {"slide"}):
             raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
-        for label, line in labelled:
-            if line.gesture == "slide":
+        for label, section in labelled:
+            if section.gesture == "slide":
                 raise ValueError(f"{label}gesture: a driven contact holds the tissue and doesn't slide")
         if has_both:
             if self.travel_mm is None:
@@ -316,8 +316,8 @@ class FemSection(Section):
         general = self.travel_mm or self.force_mn
         if self.instruments[1] > len(labelled) and general is None:
             raise ValueError("travel_mm: a driven contact needs travel_mm or force_mn")
-        for label, line in labelled:
-            if not (line.travel_mm or line.force_mn or general) or line.load is not None:
+        for label, section in labelled:
+            if not (section.travel_mm or section.force_mn or general) or section.load is not None:
                 raise ValueError(f"{label}travel_mm: a driven contact needs travel_mm or force_mn")
         return self
 

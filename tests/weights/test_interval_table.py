@@ -19,7 +19,7 @@ from bench.methods.force_interval import (
 )
 from bench.methods.force_mixture import ForceMixture
 from bench.methods.method_interface import ForceEstimate
-from weights.interval_table import Example, fit_table
+from weights.interval_table import Example, check_table, fit_table
 
 
 def draw(make: int, number: int) -> Example:
@@ -55,6 +55,18 @@ def test_new_videos_are_held_and_widths_follow_the_posterior(table: IntervalTabl
     assert widths[order[:30]].mean() < 0.6 * widths[order[-30:]].mean()
     assert table.reached["all"]["score over a constant width's"] < 0.8
     assert 0.82 < table.reached["all"]["holds"] < 0.97
+
+
+def test_a_table_checked_on_another_motion_states_what_it_holds_there(table: IntervalTable) -> None:
+    new = [draw(99, k) for k in range(60)]
+    checked = check_table(replace(table, flow="tvl1 of before"), new)
+    assert checked.flow == table.flow
+    assert checked.by_cameras == table.by_cameras
+    expected = np.mean([measure_coverage(table, example) for example in new], axis=0)
+    row = checked.checked["all"]
+    np.testing.assert_allclose([row["holds"], row["width"]], expected)
+    halved = [replace(example, true_mn=0.5 * example.true_mn) for example in new]
+    assert check_table(table, halved).checked["all"]["holds"] < 0.5
 
 
 def test_an_uncertain_stiffness_widens_it_in_proportion_to_the_force(table: IntervalTable) -> None:

@@ -162,4 +162,4 @@ def test_a_key_frame_is_no_cut_and_a_bump_is(key_interval: int) -> None:
         faults = VideoFaults(pictures[0], pictures[0], np.ones((96, 128), bool))
         for k, picture in enumerate(pictures[1:], 1):
             faults.add_decoded(k, k / 25, picture)
-        assert faults._leaps() == ([30] if is_bumped else [])
+        assert faults._find_leaps() == ([30] if is_bumped else [])
