@@ -118,7 +118,8 @@ def intervals(
 ) -> None:
     """Calibrates the interval of the force and writes its table into the package.
 
-    With `check` the table is not fitted again but judged on these recordings, whose motion it then is for.
+    With `check` the table is not fitted again but judged on these recordings, whose motion it then is for: a
+    motion that errs less needs no new one.
     """
     if not only_fit:
         for folder, make, stated in _recordings(work, foreign, count, makes.split(",")):
@@ -242,7 +243,7 @@ def fit_table(examples: Sequence[Example]) -> IntervalTable:
 
 
 def check_table(table: IntervalTable, examples: Sequence[Example]) -> IntervalTable:
-    """A table for today's motion, with what it holds on examples of that on which it was not fitted."""
+    """A table for today's motion, with what it holds on examples of that, rendered and recovered anew."""
     rows = {id(example): _judge(example, table) for example in examples}
     flow = name_motion(RecordingFlowSettings().backend)
     return replace(table, flow=flow, checked=_pool_groups(examples, rows))

@@ -95,8 +95,8 @@ class IntervalTable:
     reached: dict[str, dict[str, FiniteFloat]]
     """Counts, holds and widths by cross-validation: each make is calibrated without its recordings."""
     checked: dict[str, dict[str, FiniteFloat]] = field(default_factory=dict)
-    """The same of new recordings, with motion by `flow`, on which it was checked; empty: it was fitted on
-    that motion."""
+    """The same of recordings, rendered anew and with motion by `flow`, on which it was checked; empty: it was
+    fitted on that motion."""
 
     def bound(self, video: VideoEstimates, gain: float) -> tuple[Floats, Floats]:
         """Lower and upper ends (T,) mN. `gain`: relative standard deviation of every force, from E."""
