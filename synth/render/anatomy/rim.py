@@ -68,16 +68,12 @@ class Dura:
 
     width: tuple[float, float] = 1.3, 1.1  # mean and spread around the opening, see `_rough_wave`
     pulled: tuple[float, float] = 2.1, 2.2  # added width at a stitch, and over what distance aside
-    slope: float = 0.25  # rise outwards
-    tent: tuple[float, float] = 0.5, 1.3  # height at a stitch, and over what distance
-    folds: tuple[float, float, float] = (
-        0.16,
-        2.1,
-        2.8,
-    )  # height, waves per mm aside, reach of those at a stitch
-    soaked: tuple[float, float] = 2.0, 1.2  # its blood by the level, and by chance from place to place,
+    slope: float = 0.32  # rise outwards
+    tent: tuple[float, float] = 0.36, 1.3  # height at a stitch, and over what distance
+    folds: tuple[float, float, float] = 0.11, 2.1, 2.8  # height, waves per mm aside, and reach at a stitch
+    soaked: tuple[float, float] = 2.8, 1.4  # its blood by the level, and by chance from place to place,
     stained: tuple[float, float] = 1.3, 0.5  # more towards its end, and the part of it that stays clean
-    taut: tuple[float, float] = 0.03, 3.2  # height of the creases that its pull draws along the edge, waves
+    taut: tuple[float, float] = 0.018, 3.2  # height of the creases that its pull draws along the edge, waves
     # per mm across them, about ten times as many as along
     vessels: tuple[float, float] = 0.055, 0.5  # width of its vessels in the noise, and their optical depth
     thin: Rgb = (0.2, 0.7, 0.6)  # absorption where it is thin, and what is below shines through
@@ -103,10 +99,10 @@ class Blood:
     """Blood on the dura: pools with a level surface, smears wiped along the edge, drops."""
 
     pool: tuple[float, float] = 4.2, 0.45  # optical depth where deepest, and how much of the noise is one
-    runs: tuple[float, float] = 1.1, 0.5  # mm that one runs over the dura's end, thinning; its optical depth
+    runs: tuple[float, float] = 2.4, 2.2  # mm that one runs over the dura's end, thinning; its optical depth
     smear: float = 0.8  # optical depth
-    flood: tuple[float, float] = 1.4, 0.5  # optical depth of the film over bone and skin on the wound's lower
-    # side, and the level from which on it is
+    flood: tuple[float, float] = 3.0, 0.15  # optical depth of the film over bone and skin on the wound's
+    # lower side, and the level from which on it is
     drops: float = 12.0  # mean number on a soaked rim
     drop_mm: tuple[float, float] = 0.12, 0.55  # radius
 

@@ -71,15 +71,15 @@ class Bleeding:
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
-    absorption_per_mm: Rgb = (0.42, 4.25, 6.0)
+    absorption_per_mm: Rgb = (0.3, 3.6, 5.6)
     rosy: Rgb = (0.9, 4.4, 4.6)  # that of wide ones and of some stretches, under more of the arachnoid
     rosy_share: tuple[float, float, float] = 0.1, 0.55, 0.3  # of it: of fine ones, of wide ones more, spread
     opaque: tuple[float, float] = 0.3, 0.08  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.72, 0.22, 0.165)  # albedo
+    wall: Rgb = (0.8, 0.27, 0.16)  # albedo
     wide: tuple[float, float] = 0.1, 0.2  # radius of the first opaque walls, and span to fully opaque ones
     crossing: float = 0.9  # opacity of a wall over a vein, as a share of that of the widest artery's
     rim: tuple[float, float] = 0.95, 0.4  # of a wide one's radius: middle and width of its dark rims
-    rim_dark: Rgb = (0.35, 0.8, 0.7)  # absorption
+    rim_dark: Rgb = (0.2, 0.6, 0.55)  # absorption
     covered: tuple[float, float] = 0.98, 0.3  # of its redness along it, by the arachnoid: mean, and spread
 
 
@@ -92,7 +92,7 @@ class Vein:
     margin_dark: Rgb = (0.36, 0.85, 0.62)  # absorption
     crest: float = 0.5  # of a thick one's radius: width of its bluish crest
     pale: Rgb = (0.66, 0.56, 0.66)  # albedo of the sheen along it, beside the highlight,
-    gleam: tuple[float, float, float] = 0.42, 0.22, 0.34  # its share: mean, spread; its width in radii
+    gleam: tuple[float, float, float] = 0.2, 0.15, 0.34  # its share: mean, spread; its width in radii
     rim: tuple[float, float] = 0.9, 0.36  # of a thick one's radius: middle and width of its dark rims
     rim_dark: Rgb = (0.8, 1.15, 0.85)  # absorption
     mottle: float = 0.14  # standard deviation of its wall's albedo, as a share of it
@@ -117,11 +117,13 @@ class Film:
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
     reach_mm: tuple[float, float] = 0.12, 0.45  # where it ends, of the finest vessels and of wide ones
+    thin: float = 4.6  # of a film's thinness, from 0 in pools to 1 where it mirrors nothing: mean,
+    uneven: float = 1.5  # and spread
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.05  # standard deviation of slopes where the film is thin
     level: float = 0.15  # share of the pia's slope that a pool takes away,
     filled: float = 0.6  # and of the relief under it
-    ripples: float = 0.045  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
+    ripples: float = 0.038  # standard deviation of its slopes: a level pool mirrors a lamp as one white patch
     ripples_mm: float = 0.3  # blur that makes them
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
@@ -386,7 +388,7 @@ def _film(
         relief = (
             relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
         )
-    thinness = 3.0 + 1.5 * unevenness - 3 * wetness
+    thinness = Film.thin + Film.uneven * unevenness - 3 * wetness
     dry = np.clip(thinness, 0.05, 0.85)
     pools = np.clip(1.6 * noise.blur((0.9 - thinness).astype(np.float32), Film.pool_mm, extent), 0, 1)
     dry = np.minimum(dry, 1 - pools)

@@ -54,11 +54,11 @@ class Kind:
 
 
 VEINS = Kind(
-    roots=(1, 3), through=(2, 4), inside=(0, 1), trunk=(0.45, 0.95), coarse=2.5, spacing=5.0,
+    roots=(1, 3), through=(2, 4), inside=(0, 1), trunk=(0.55, 1.15), coarse=2.5, spacing=5.0,
     end=(0.06, 0.11), crown=3.0, chance=0.9, sharing=0.4, stiff=0.25, taper=3.0, bends=(0.25, 0.5),
 )  # fmt: skip
 ARTERIES = Kind(
-    roots=(2, 5), through=(2, 4), inside=(2, 5), trunk=(0.2, 0.38), coarse=1.0, spacing=0.62,
+    roots=(2, 5), through=(2, 4), inside=(2, 5), trunk=(0.29, 0.54), coarse=1.0, spacing=0.62,
     end=(0.024, 0.045), crown=0.7, chance=1.0, sharing=0.2, stiff=0.3, taper=2.4, bends=(0.14, 0.35),
     loops=0.05,
 )  # fmt: skip
@@ -73,10 +73,10 @@ TRIBUTARIES = (
     Growth(spacing=3.0, reach=8.0, kill_distance=1.4, step=0.2, straight=1.2, end=(0.045, 0.09)),
 )
 ARTERIOLES = (
-    Growth(spacing=3.2, reach=12.0, kill_distance=0.9, step=0.22, straight=3.0, end=(0.03, 0.04)),
-    Growth(spacing=1.5, reach=5.0, kill_distance=0.45, step=0.16, straight=2.4, end=(0.03, 0.036)),
-    Growth(spacing=0.88, reach=2.5, kill_distance=0.24, step=0.12, straight=2.2, end=(0.022, 0.030)),
-    Growth(spacing=0.5, reach=1.5, kill_distance=0.16, step=0.1, straight=1.8, end=(0.017, 0.027)),
+    Growth(spacing=3.2, reach=12.0, kill_distance=0.9, step=0.22, straight=3.0, end=(0.045, 0.06)),
+    Growth(spacing=1.5, reach=5.0, kill_distance=0.45, step=0.16, straight=2.4, end=(0.038, 0.048)),
+    Growth(spacing=1.05, reach=2.5, kill_distance=0.24, step=0.12, straight=2.2, end=(0.028, 0.038)),
+    Growth(spacing=0.75, reach=1.5, kill_distance=0.16, step=0.1, straight=1.8, end=(0.022, 0.032)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
@@ -91,7 +91,7 @@ _ENDS_MM, _ENDS = (0.0, 0.55, 1.1, 1.8), (0.013, 0.023, 0.046, 0.2)  # most radi
 _WIDENS = 1.08  # times, at most and besides, from a node to the next one up
 _WINDING = 0.12, 1.9  # shift of fine vessels, and over what distance
 _BENT = 0.2, 4.5  # that of all arteries; wide veins lie where the mesh is raised
-_WIDEST_MM = 0.5  # radius that no artery of the pia reaches, whatever its branches sum up to
+_WIDEST_MM = 0.55  # radius that no artery of the pia reaches, whatever its branches sum up to
 _SUPPLE_MM = 0.12  # radius of a vessel that winds half as much
 
 

@@ -47,9 +47,9 @@ class Ranges:
     `evidence.appearance` compares renderings with one.
     """
 
-    gyrus_albedo: Colour = (0.95, 0.765, 0.53)
-    perfused_albedo: Colour = (0.95, 0.61, 0.41)
-    vein_crest_albedo: Colour = (0.31, 0.255, 0.31)
+    gyrus_albedo: Colour = (0.93, 0.735, 0.49)
+    perfused_albedo: Colour = (0.945, 0.57, 0.375)
+    vein_crest_albedo: Colour = (0.24, 0.2, 0.27)
     vein_side_albedo: Colour = (0.23, 0.07, 0.085)
     arterial_absorption: Ends = (1.1, 1.5)
     subpial_absorbance_per_mm: Ends = (1.4, 2.2)
@@ -61,7 +61,7 @@ class Ranges:
     roughness: Ends = (0.018, 0.026)
     dry_roughness: Ends = (0.2, 0.28)
     blood: Ends = (0.25, 0.75)
-    dura_albedo: Colour = (0.86, 0.6, 0.5)
+    dura_albedo: Colour = (0.9, 0.7, 0.6)
     surroundings_albedo: Colour = (0.40, 0.10, 0.065)
 
 
