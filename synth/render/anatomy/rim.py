@@ -68,8 +68,8 @@ class Dura:
 
     width: tuple[float, float] = 1.3, 1.1  # mean and spread around the opening, see `_rough_wave`
     pulled: tuple[float, float] = 2.1, 2.2  # added width at a stitch, and over what distance aside
-    slope: float = 0.32  # rise outwards
-    tent: tuple[float, float] = 0.36, 1.3  # height at a stitch, and over what distance
+    slope: float = 0.25  # rise outwards
+    tent: tuple[float, float] = 0.5, 1.3  # height at a stitch, and over what distance
     folds: tuple[float, float, float] = 0.11, 2.1, 2.8  # height, waves per mm aside, and reach at a stitch
     soaked: tuple[float, float] = 2.8, 1.4  # its blood by the level, and by chance from place to place,
     stained: tuple[float, float] = 1.3, 0.5  # more towards its end, and the part of it that stays clean

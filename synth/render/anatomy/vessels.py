@@ -54,11 +54,11 @@ class Kind:
 
 
 VEINS = Kind(
-    roots=(1, 3), through=(2, 4), inside=(0, 1), trunk=(0.55, 1.15), coarse=2.5, spacing=5.0,
+    roots=(1, 3), through=(2, 4), inside=(0, 1), trunk=(0.45, 0.95), coarse=2.5, spacing=5.0,
     end=(0.06, 0.11), crown=3.0, chance=0.9, sharing=0.4, stiff=0.25, taper=3.0, bends=(0.25, 0.5),
 )  # fmt: skip
 ARTERIES = Kind(
-    roots=(2, 5), through=(2, 4), inside=(2, 5), trunk=(0.29, 0.54), coarse=1.0, spacing=0.62,
+    roots=(2, 5), through=(2, 4), inside=(2, 5), trunk=(0.2, 0.38), coarse=1.0, spacing=0.62,
     end=(0.024, 0.045), crown=0.7, chance=1.0, sharing=0.2, stiff=0.3, taper=2.4, bends=(0.14, 0.35),
     loops=0.05,
 )  # fmt: skip
@@ -79,6 +79,8 @@ ARTERIOLES = (
     Growth(spacing=0.75, reach=1.5, kill_distance=0.16, step=0.1, straight=1.8, end=(0.022, 0.032)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
+_SEEN_VEIN, _SEEN_TRUNK = 1.22, 1.42  # radius that is seen over that which shapes the mesh: a vessel's sunk
+# part shines through the pia
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.22  # radius of such a vein
 _TWIG_MM = 0.25  # shorter side branches are left out: they look like thorns,
@@ -116,7 +118,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     artery_density *= (distance > width + 0.3) | (width < 0.3)
     trunks = _grow(ARTERIES, sulci, artery_density.astype(np.float32), extent_mm, rng)
     deep = _grow(DEEP, sulci, uniform_density, extent_mm, rng)
-    smooth_veins = _smooth(_prune(veins, 0.05), 1.6)
+    smooth_veins = _widen(_smooth(_prune(veins, 0.05), 1.6), _SEEN_VEIN)
     visible_veins = smooth_veins
     for growth in TRIBUTARIES:
         visible_veins = colonisation.fill(
@@ -128,9 +130,8 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     free_density = (
         ~vein_margin * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)
     ).astype(np.float32)
-    arteries = main_arteries = _thin_ends(
-        _smooth(_level_radii(_keep_entering(_prune(trunks, _TRUNK_MM), extent_mm)), 1.3)
-    )
+    main_arteries = _smooth(_level_radii(_keep_entering(_prune(trunks, _TRUNK_MM), extent_mm)), 1.3)
+    arteries = main_arteries = _thin_ends(_widen(main_arteries, _SEEN_TRUNK))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(
             arteries, _place_targets(growth, free_density, extent_mm, rng), growth, rng
@@ -181,6 +182,11 @@ def _smooth(tree: Tree, over_mm: float) -> Tree:
     state = np.column_stack([tree.nodes, np.log(tree.radius)])
     state = relax(state, tree.parent, tree.radius**2, 1e-3, rounds)
     return Tree(state[:, :2], tree.parent, np.exp(state[:, 2]))
+
+
+def _widen(tree: Tree, factor: float) -> Tree:
+    """The tree with radii times a factor."""
+    return Tree(tree.nodes, tree.parent, factor * tree.radius)
 
 
 def _thin_ends(tree: Tree) -> Tree:
