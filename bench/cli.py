@@ -15,7 +15,19 @@ import typer
 from typer import Argument, Option
 
 from bench.importers.import_formats import list_endings
-from learn.inference.camera_options import Calibration, MmPerUnit, Right
+from learn.inference.video_options import (
+    Calibration,
+    Masks,
+    MmPerUnit,
+    Overlay,
+    Pulse,
+    Rate,
+    Rest,
+    Right,
+    Scale,
+    Shrink,
+    Tissue,
+)
 from synth.errors import UserError, as_user_error
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands, printable
@@ -36,7 +48,6 @@ app = typer.Typer(
 Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
-Masks = Annotated[str, Option(help="auto, none, or a folder of NNNNNN.png or mask.png.")]
 ModelFolder = Annotated[
     Path | None, Option("--model", "-m", help="A model's folder, or stereo. Default: physics.")
 ]
@@ -124,7 +135,7 @@ def _print_result(result: Result, folder: Path) -> None:
 def estimate(
     source: Annotated[Path, Argument(help="Video, PNGs' folder, dataset, store, or .npz of flow.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
-    scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
+    scale: Scale = None,
     young: Young = None,
     young_uncertainty: Annotated[
         float, Option(min=0.0, max=0.999, help="Its relative standard deviation: widens the interval.")
@@ -134,20 +145,21 @@ def estimate(
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
     ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
+    free: Annotated[
+        list[str] | None, Option(help="Span without contact, START:END in s of the video; may be repeated.")
+    ] = None,
     right: Right = None,
     calibration: Calibration = None,
     mm_per_unit: MmPerUnit = 1.0,
-    tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
+    tissue: Tissue = None,
     masks: Masks = "auto",
     input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
-    rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
-    rest: Annotated[
-        int, Option(min=0, help="Number of the frame in which the tissue is unloaded; forces begin there.")
-    ] = 0,
-    pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
-    overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
+    shrink: Shrink = 0,
+    rate: Rate = 10.0,
+    rest: Rest = 0,
+    pulse: Pulse = True,
+    overlay: Overlay = True,
     json: Json = False,
 ) -> None:
     """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
@@ -178,6 +190,7 @@ def estimate(
         living=living,
         given=options.given,
         young_uncertainty=young_uncertainty,
+        free_s=[_read_span(text) for text in free or ()],
     )
     videos, predictions = motions(source, choose_input(source, input), options), []
     for file in predict_files(by_physics, videos, source, out, overlay):
@@ -460,6 +473,16 @@ def _print_frame(frame: LiveFrame) -> None:
     mark = "" if frame.trusted else "  not trusted"
     timing = f"{1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px"
     print(f"frame {frame.index:5}  {timing}{force}{mark}", flush=True)
+
+
+def _read_span(text: str) -> tuple[float, float]:
+    """START:END in seconds. UserError for anything else, and if it does not run forward."""
+    start, _, end = text.partition(":")
+    with as_user_error(f"--free {text}: expected START:END in seconds of the video"):
+        span = float(start), float(end)
+    if not span[0] < span[1]:
+        raise UserError(f"--free {text}: does not end after it starts")
+    return span
 
 
 def _parse_rectangle(text: str) -> tuple[int, int, int, int] | None:

@@ -30,7 +30,7 @@ _SMALL = ("render.size=[256, 192]",)
 DATASETS: Mapping[str, tuple[str, ...]] = {
     "mission": ("mission", "sequences=375"),  # as many as the stored gap is of
     "mission-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80"),
-    "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", *_SMALL),
+    "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", "render.stereo_mm=24", *_SMALL),
     "paper": (
         "paper",
         "sequences=90",

@@ -12,7 +12,19 @@ import typer
 from rich.console import Console
 from typer import Argument, Option
 
-from learn.inference.camera_options import Calibration, MmPerUnit, Right
+from learn.inference.video_options import (
+    Calibration,
+    Masks,
+    MmPerUnit,
+    Overlay,
+    Pulse,
+    Rate,
+    Rest,
+    Right,
+    Scale,
+    Shrink,
+    Tissue,
+)
 from synth.errors import UserError
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands
@@ -210,20 +222,18 @@ def predict_command(
     input: Input = None,
     young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     membrane: Annotated[MembraneState, Option(help="Of the pia, for a model with that input.")] = "unknown",
-    scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
+    scale: Scale = None,
     right: Right = None,
     calibration: Calibration = None,
     mm_per_unit: MmPerUnit = 1.0,
-    tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
+    tissue: Tissue = None,
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
-    shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
-    rate: Annotated[float, Option(min=0.0, help="Most frames per second of a video; 0: all.")] = 10.0,
-    rest: Annotated[int, Option(min=0, help="Number of a video's frame in which tissue is unloaded.")] = 0,
-    pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion.")] = True,
-    masks: Annotated[
-        str, Option(help="Of a video: auto, none, or a folder of NNNNNN.png or mask.png.")
-    ] = "auto",
-    overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
+    shrink: Shrink = 0,
+    rate: Rate = 10.0,
+    rest: Rest = 0,
+    pulse: Pulse = True,
+    masks: Masks = "auto",
+    overlay: Overlay = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:

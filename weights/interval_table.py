@@ -245,8 +245,12 @@ def fit_table(examples: Sequence[Example]) -> IntervalTable:
 def check_table(table: IntervalTable, examples: Sequence[Example]) -> IntervalTable:
     """A table for today's motion, with what it holds on examples of that, rendered and recovered anew."""
     rows = {id(example): _judge(example, table) for example in examples}
-    flow = name_motion(RecordingFlowSettings().backend)
-    return replace(table, flow=flow, checked=_pool_groups(examples, rows))
+    return replace(table, flow=_name_motion(), checked=_pool_groups(examples, rows))
+
+
+def _name_motion() -> str:
+    """Name of the motion that recordings are tracked by."""
+    return name_motion(RecordingFlowSettings().backend)
 
 
 def _pool_groups(
@@ -279,7 +283,7 @@ def _fit(examples: Sequence[Example]) -> IntervalTable:
         features=tuple(force_interval.NAMES),
         by_cameras=by_cameras,
         makes=count,
-        flow=name_motion(RecordingFlowSettings().backend),
+        flow=_name_motion(),
         stating={},
         reached={},
     )

@@ -220,7 +220,8 @@ class Meta(Section):
     """Whether the tissue still has its membrane (pia, arachnoid): `intact`, `stripped` or `unknown`."""
     membrane_mn_per_mm: Annotated[tuple[Positive, Positive], AfterValidator(_must_not_fall)] | None = None
     """Range of its stiffness, thickness times Young's modulus [mN/mm], e.g. of a strip that was pulled: what
-    force by physics depends on most where there is a membrane. Default: unknown, some 10 to 250."""
+    force by physics depends on most where there is a membrane. Default: not known; of an intact one 35,
+    within 13 to 95 in two of three (docs/science.md, "Membrane and pulse")."""
     poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
     """Range of the tissue's Poisson's ratio."""
     alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +31,7 @@ from synth.errors import UserError, as_positive
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.finding import first_fault, judge_young, problems
+from synth.flow.recording.harmonic_fit import Span
 from synth.job.types import MembraneState
 from synth.video.read_video import FPS
 
@@ -44,6 +46,7 @@ def estimate(
     membrane: MembraneState = "unknown",
     membrane_mn_per_mm: tuple[float, float] | None = None,
     living: bool = True,
+    free_s: Sequence[Span] = (),
     tissue: str | Path | Array | None = None,
     masks: str | Path | Array = "auto",
     pulse: bool = True,
@@ -67,6 +70,8 @@ def estimate(
         membrane: state of the membrane (pia).
         membrane_mn_per_mm: range of its stiffness, thickness times Young's modulus; None: unknown.
         living: whether heart and breath may move the tissue; False: ex vivo, or a phantom.
+        free_s: begin and end [s] of spans of the video without contact, which show what else moves the
+            tissue; empty: they are looked for.
         tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.
         masks: auto or none; or instrument masks: (T, H, W), (H, W) or a folder.
         pulse: whether heartbeat and breathing are subtracted from a video's motion.
@@ -93,7 +98,7 @@ def estimate(
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     motion = read_single(source, motions(source, choose_input(source, input), options))
     statements = young_kpa, membrane, membrane_mn_per_mm, living, options.given
-    return apply_physics(motion, *statements, young_uncertainty=young_uncertainty)
+    return apply_physics(motion, *statements, young_uncertainty=young_uncertainty, free_s=free_s)
 
 
 def choose_input(source: Path | Array, requested: str | None) -> str:
@@ -123,12 +128,13 @@ def apply_physics(
     given: tuple[bool, bool] = (False, False),
     *,
     young_uncertainty: float = 0.0,
+    free_s: Sequence[Span] = (),
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa` to `living`, `young_uncertainty`: as of `estimate`; `given`: as of `VideoOptions`. Returns
-    those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid modulus
-    or stiffness.
+    `young_kpa` to `living`, `young_uncertainty`, `free_s`: as of `estimate`; `given`: as of `VideoOptions`.
+    Returns those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid
+    modulus or stiffness, and for a span that holds no frame.
     """
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
@@ -142,13 +148,13 @@ def apply_physics(
         stiffness = min(low, high), max(low, high)
     extra: dict[str, Any] = {"living": living, "recovered_by": recovered_by, "membrane_mn_per_mm": stiffness}
     scene, physics = MethodContext(motion.tissue, scale, young, membrane, **extra), Physics()
-    track = _follow(motion, scene, physics)
+    track = _follow(motion, scene, physics, free_s)
     findings = problems([*judge_young(young), *motion.findings])
     trusted = track.trusted & (not first_fault(findings))
     bounds_mn, warnings = np.full((len(trusted), 2), np.nan), list(physics.warnings)
     if trusted.any():
         estimates = [track.estimates[k] for k in np.flatnonzero(trusted)]
-        stated = float(np.mean([*given, membrane != "unknown", not living]))
+        stated = float(np.mean([*given, membrane != "unknown", not living or bool(free_s)]))
         video = force_interval.gather(estimates, track.moved_mm[trusted], track.cameras, stated)
         estimates, reason = force_interval.bound(estimates, video, young_uncertainty, recovered_by)
         bounds_mn[trusted] = [(force.low_mn, force.high_mn) for force in estimates]
@@ -176,7 +182,7 @@ def apply_physics(
     return out | {"notes": notes}
 
 
-def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> PhysicsTrack:
+def _follow(motion: Motion, scene: MethodContext, physics: Physics, free_s: Sequence[Span]) -> PhysicsTrack:
     """Applies physics to every frame, and again to all once spans without contact are known."""
     search, cameras = ContactFreeSearch(motion.tissue, scene.scale_mm_per_px), 1
     rows = list[tuple[int, float, bool, float]]()
@@ -187,7 +193,10 @@ def _follow(motion: Motion, scene: MethodContext, physics: Physics) -> PhysicsTr
         rows.append((frame.index, time_s, frame.trusted, force_interval.find_motion(frame.flow, scene)))
         cameras = 1 if frame.motion is None else 2
     index, times, trusted, moved_mm = map(np.array, zip(*rows, strict=True))
+    for start, end in free_s:
+        if not (trusted & (times >= start) & (times <= end)).any():
+            raise UserError(f"free_s: no frame of the video was followed between {start:g} and {end:g} s")
     # False without spans.
-    inside = np.any([(times >= start) & (times <= end) for start, end in search.find()], axis=0)
+    inside = np.any([(times >= start) & (times <= end) for start, end in free_s or search.find()], axis=0)
     estimates = physics.revise(np.asarray(trusted & inside))
     return PhysicsTrack(index, times, trusted, moved_mm, cameras, estimates)

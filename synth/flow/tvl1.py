@@ -229,12 +229,11 @@ def _refine(
         if flow.shape[1:] != shape:
             flow = upsample(flow, levels[k])
         level_weight = image.resize(weight[None], shape)[0]
+        settings = s
+        if k + skipped > 0:
+            level_weight, settings = np.float32(s.coarse_weight) * level_weight, s.derive_coarse()
         reference = None if references is None else references[k]
-        if k + skipped == 0:
-            flow = _solve_level(levels[k], flow, level_weight, s, reference)
-        else:
-            level_weight = np.float32(s.coarse_weight) * level_weight
-            flow = _solve_level(levels[k], flow, level_weight, s.derive_coarse(), reference)
+        flow = _solve_level(levels[k], flow, level_weight, settings, reference)
     return flow
 
 

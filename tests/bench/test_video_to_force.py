@@ -1,6 +1,7 @@
 """`learn predict`, `bench estimate` and `bench score` give the same forces for a video."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ import bench.cli
 import learn.cli
 import synth
 from bench.methods import comparison
+from bench.tracking.estimate import apply_physics
+from learn.inference.video_motion import Motion
+from synth.flow.recording.frame_motion import FrameMotion
 from synth.video.read_video import read_frames
 
 FPS, SIZE = 25.0, (96, 704)
@@ -69,6 +73,40 @@ def test_a_rest_frame_leaves_out_what_comes_before(make: Maker, tmp_path: Path) 
     assert late["total_force_mn"].max() > 0
     with pytest.raises(synth.UserError, match="rest_frame"):
         bench.estimate(next(iter(synth.sample())).path, rest_frame=1)
+
+
+@pytest.mark.slow
+def test_stated_spans_without_contact_tell_the_tissues_own_motion_from_force() -> None:
+    side, pitch = 64, 0.5
+    y, x = pitch * (np.mgrid[:side, :side] - side / 2)
+    times = np.arange(48) / 8
+
+    def move() -> Iterator[FrameMotion]:
+        for k, time_s in enumerate(times):
+            wave = np.sin(2 * np.pi * 1.1 * time_s)
+            press = 1.2 * (time_s >= 4) * np.exp(-(x**2 + y**2) / 18)
+            flow = np.stack([0.6 * wave * (y / 16) ** 2, 0.4 * wave * x / 16 + press], axis=-1)
+            yield FrameMotion(
+                flow.astype(np.float32), np.full((side, side), 0.95, np.float32), index=k, time_s=time_s
+            )
+
+    motion = Motion("own", move, np.full((side, side), True), pitch, 1.0)
+    unstated, stated = (
+        apply_physics(motion, membrane="stripped", free_s=spans)["total_force_mn"]
+        for spans in ((), [(0.0, 3.9)])
+    )
+    before = times < 4
+    assert stated[before].max() < 0.6 * unstated[before].max()
+    assert stated[~before].min() > 5 * stated[before].max()
+    with pytest.raises(synth.UserError, match="free_s"):
+        apply_physics(motion, membrane="stripped", free_s=[(7.0, 9.0)])
+
+
+@pytest.mark.parametrize("span", ["3", "a:b", "4:2", ""])
+def test_a_span_that_cannot_be_read_is_refused(span: str, tmp_path: Path) -> None:
+    words = [next(iter(synth.sample())).path, "--free", span, "-o", tmp_path / "forces"]
+    run(bench.cli.app, "estimate", *words, code=2)
+    assert not (tmp_path / "forces").exists()
 
 
 @pytest.mark.slow
