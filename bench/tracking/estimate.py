@@ -64,7 +64,7 @@ def estimate(
 
     Args:
         source: frames (T, H, W, 3) uint8, a video, a folder of PNGs, a sequence or an .npz of flow.
-        scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
+        scale_mm_per_px: of a video; unknown: forces are right up to a factor; None: two cameras measure it.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         young_uncertainty: its relative standard deviation, which widens the interval.
         membrane: state of the membrane (pia).

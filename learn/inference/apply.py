@@ -50,7 +50,7 @@ def predict(
     Args:
         source: frames (T, H, W, 3) uint8, a video, a folder of PNGs, a sequence or an .npz of flow.
         model: from `load_model`, its folder or the name of a pretrained one.
-        scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
+        scale_mm_per_px: of a video; unknown: forces are right up to a factor; None: two cameras measure it.
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia), for a model with that input.
         tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.

@@ -23,6 +23,8 @@ from synth.flow.recording.pair_findings import judge_pair
 from synth.flow.recording.stereo_motion import RightVideo
 from synth.flow.recording.video_track import track_video
 from synth.flow.stereo.calibration import read_rig
+from synth.flow.stereo.rest import measure_scale
+from synth.flow.stereo.rig import StereoRig
 from synth.flow.stereo.stereo_track import Motion3D
 from synth.system import checked_file
 from synth.video import file_numbers
@@ -120,8 +122,8 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
-    instead of flow and confidence. Raises UserError for anything else, for a video without a scale, for a
-    rest frame or a second camera of stored motion, and for a second camera without a known scale.
+    instead of flow and confidence. Raises UserError for anything else, for a video of one camera without a
+    scale, and for a rest frame or a second camera of stored motion.
     """
     if isinstance(path, np.ndarray) or video.is_video(path):
         yield _video(path, options or VideoOptions())
@@ -183,7 +185,8 @@ def _read_stored(sequence: Sequence, source: str) -> Motion:
 
 def _video(source: Path | Array, options: VideoOptions) -> Motion:
     path = source if isinstance(source, Path) else Path("frames")
-    if options.scale_mm_per_px is None:
+    is_measured = options.scale_mm_per_px is None and options.second is not None
+    if options.scale_mm_per_px is None and not is_measured:
         raise UserError(f"{path}: a video needs its scale (scale_mm_per_px, --scale): mm/px, or unknown")
     if isinstance(source, np.ndarray):
         _check_frames(str(path), source)
@@ -209,14 +212,16 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
         tissue,
         tool,
         options.rest_frame,
-        depth=_right(source, options, notes),
+        depth=None if options.second is None else _right(source, options, options.second, notes),
     )
     track = track_video(footage, options.settings, compare_cameras=footage.depth is not None)
     rest, findings = track.video.rest, [*track.video.findings]
-    scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
+    stated = options.scale_mm_per_px if footage.depth is None else footage.depth.mm_per_px
+    scale = pixel_mm("unknown" if stated is None else stated, rest.size[1])
     if track.pair is not None and (quality := track.pair.quality) is not None:
         notes.append(quality.describe())
-        findings += judge_pair(quality, scale)
+        findings += judge_pair(quality, None if is_measured else scale)
+        scale = quality.mm_per_px if is_measured else scale
     removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
     missing = [finding.message for finding in findings if finding.severity == "missing"]
     return Motion(
@@ -233,29 +238,37 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     )
 
 
-def _right(source: Path | Array, options: VideoOptions, notes: list[str]) -> RightVideo | None:
-    """The right camera of a video, if there is one; `notes` receives how its pictures are counted.
+def _right(source: Path | Array, options: VideoOptions, second: SecondCamera, notes: list[str]) -> RightVideo:
+    """The right camera of a video; `notes` receives how its pictures are counted, and a measured scale.
 
-    UserError: the video's scale is unknown, or what is given is no video.
+    UserError: the video's scale is stated to be unknown, or what is given is no video.
     """
-    second, scale = options.second, options.scale_mm_per_px
-    if second is None:
-        return None
-    if scale is None or isinstance(scale, str):
-        raise UserError("right: with a second camera the video's scale in mm/px is needed")
+    scale = options.scale_mm_per_px
+    if scale == "unknown":
+        raise UserError("right: two cameras measure the scale: leave it out, or state it in mm/px")
     if isinstance(second.pictures, np.ndarray):
         _check_frames("right", second.pictures)
     elif not video.is_video(second.pictures):
         raise UserError(f"right: {second.pictures} is neither a video nor a folder of PNGs")
     frame_of = file_numbers.match_numbers(_numbers(second.pictures), _numbers(source), "right", notes)
-    return RightVideo(
-        lambda: (
-            replace(picture, index=frame_of.get(picture.index, picture.index))
-            for picture in _pictures(second.pictures, options.fps)
-        ),
-        lambda size: read_rig(second.calibration, size[::-1], second.mm_per_unit),
-        scale,
-    )
+
+    def read() -> Iterator[video.Picture]:
+        for picture in _pictures(second.pictures, options.fps):
+            yield replace(picture, index=frame_of.get(picture.index, picture.index))
+
+    def read_rig_of(size: Size) -> StereoRig:
+        return read_rig(second.calibration, size[::-1], second.mm_per_unit)
+
+    if scale is None:
+        left, right = (
+            next((picture.rgb for picture in pictures if picture.index == options.rest_frame), None)
+            for pictures in (_pictures(source, options.fps), read())
+        )
+        if left is None or right is None:
+            raise UserError(f"right: no pair of frames {options.rest_frame}, by which the scale is measured")
+        scale = measure_scale(read_rig_of(left.shape[:2]), left, right)
+        notes.append(f"scale about {scale:.3g} mm/px in the middle of the picture, by both cameras")
+    return RightVideo(read, read_rig_of, scale)
 
 
 def _numbers(source: Path | Array) -> Collection[int]:

@@ -7,7 +7,9 @@ from typing import Annotated
 
 from typer import Option
 
-Scale = Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")]
+Scale = Annotated[
+    str | None, Option(help="A video's [mm/px]; unknown: forces up to a factor. Two cameras measure it.")
+]
 Tissue = Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")]
 Masks = Annotated[str, Option(help="Of the instruments: auto, none, or a folder of NNNNNN.png or mask.png.")]
 Shrink = Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")]

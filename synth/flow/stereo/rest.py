@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from synth.arrays import Map, Mask
+from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
-from synth.flow.image import flags
+from synth.flow.image import flags, luminance
+from synth.flow.stereo.rig import Rectified, StereoRig
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
@@ -78,6 +79,24 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
         raise error
     row_error_px = float(np.median(np.abs(flow[1][reliable])))
     return Rest(np.where(refined, -flow[0], filled).astype(np.float32), matched, row_error_px)
+
+
+def measure_scale(rig: StereoRig, left: Pixels, right: Pixels) -> float:
+    """Millimetres per pixel of the left picture, (H, W, 3) like the right one, in its middle half.
+
+    UserError: the pictures differ in size or do not match.
+    """
+    height, width = left.shape[:2]
+    if right.shape != left.shape:
+        raise UserError(f"stereo: pictures {left.shape[:2]} and {right.shape[:2]} differ")
+    rectified, middle = Rectified(rig), np.zeros((height, width), bool)
+    middle[height // 4 : -height // 4, width // 4 : -width // 4] = True
+    left_grey, right_grey = (
+        rectified.picture(luminance(picture), camera) for camera, picture in enumerate((left, right))
+    )
+    usable = rectified.flags(middle, 0), np.full((height, width), True)
+    rest = match(left_grey, right_grey, *usable, refine=False)
+    return float(np.median(rectified.depth(rest.disparity)[rest.matched])) / rectified.focal
 
 
 def _refine(left: Map, right: Map, left_usable: Mask, right_usable: Mask, disparity: Map) -> tuple[Map, Map]:

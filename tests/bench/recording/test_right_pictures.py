@@ -187,6 +187,9 @@ def test_estimate_of_two_videos_is_that_of_their_recording(make: Make) -> None:
         (folder / f"right/{number:03d}.png").rename(folder / f"right/{number + 1:03d}.png")
     renumbered = bench.estimate(folder / "frames", **about, **pair)
     assert renumbered["force_mn"] == pytest.approx(stereo["force_mn"], rel=1e-9)
+    measured = bench.estimate(folder / "frames", **(about | {"scale_mm_per_px": None}), **pair)
+    assert measured["scale_mm_per_px"] == pytest.approx(scale, rel=0.01)
+    assert measured["total_force_mn"] == pytest.approx(stereo["total_force_mn"], rel=0.05, abs=1e-3)
     grey = np.zeros((3, 120, 160), np.uint8)
     with pytest.raises(UserError, match=r"^right: uint8"):
         bench.estimate(folder / "frames", **about, **(pair | {"right": grey}))
