@@ -93,7 +93,7 @@ class TissueWeights:
         indices = [
             k
             for k, tissue in enumerate(self.tissues)
-            if (tissue.edge, tissue.stretch) == (first.edge, first.stretch)
+            if (tissue.edge, tissue.stretch) == (first.edge, first.stretch) and tissue.membrane > 0
         ]
         logs = np.log([self.tissues[k].membrane for k in indices])
         return replace(first, membrane=float(f"{np.exp(np.average(logs, weights=self.weight[indices])):.3g}"))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.methods.compliance import Edge, TissueKind
-from bench.methods.physics import TISSUES, find_largest
+from bench.methods.physics import TISSUES, TissueWeights, find_largest
 
 EDGES: tuple[Edge, ...] = ("bonded", "slipping")
 
@@ -35,3 +35,11 @@ def test_the_most_likely_tissue_is_that_of_all(seed: int) -> None:
 def test_a_single_candidate_is_the_answer() -> None:
     candidate = TissueKind("bonded", 0.0, 0.45)
     assert find_largest([candidate], lambda _: 0.0) == candidate
+
+
+def test_the_stiffness_of_large_motion_ignores_tissues_without_a_membrane() -> None:
+    tissues = TissueKind(membrane=40.0), TissueKind(), TissueKind(membrane=10.0)
+    own_mm = np.zeros((2, 6, 0))
+    middle = TissueWeights(tissues, np.array([0.5, 0.25, 0.25]), own_mm, False).middle
+    assert middle.membrane == pytest.approx(40 ** (2 / 3) * 10 ** (1 / 3), rel=1e-2)
+    assert TissueWeights(tissues[1:], np.array([0.5, 0.5]), own_mm, False).middle == TissueKind()
