@@ -15,6 +15,7 @@ from synth.dataset.store import Sequence
 _RETURN_PX = 4.0
 _COMPLIANCE_STEP = 0.25  # relative change from frame to frame
 _PULSE_KNOWN = 0.1  # relative uncertainty of the pulse's work
+LEAST_MOVING_PX = 400  # that move by over 3 px, by which `warp` judges
 
 
 def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -126,7 +127,8 @@ def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         # Smaller motion hardly changes smooth tissue: differences would be highlights and noise only.
         moving = np.hypot(flow[..., 0], flow[..., 1]) > 3.0
         pixels = clear & sequence["visible"][t] & unblocked & ~blocked & moving
-        if pixels.sum() < 200:
+        # Fewer are a ring about the instrument, in which its shadow and the dent's shading differ most.
+        if pixels.sum() < LEAST_MOVING_PX:
             continue
         contrast = _contrast(sequence["rgb"][t])
         unwarped = cv2.remap(contrast, x, y, cv2.INTER_LINEAR)

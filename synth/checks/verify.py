@@ -53,7 +53,7 @@ MEANINGS = {
 _NOTHING = {
     "contact": "no whole contact in view",
     "compliance": "no load in two frames in turn",
-    "warp": "no 200 visible pixels move by over 3 px",
+    "warp": f"no {physics_checks.LEAST_MOVING_PX} visible pixels move by over 3 px",
 }
 """The reason for which a check has measured nothing in any frame; else no tissue is visible."""
 
