@@ -15,19 +15,7 @@ import typer
 from typer import Argument, Option
 
 from bench.importers.import_formats import list_endings
-from learn.inference.video_options import (
-    Calibration,
-    Masks,
-    MmPerUnit,
-    Overlay,
-    Pulse,
-    Rate,
-    Rest,
-    Right,
-    Scale,
-    Shrink,
-    Tissue,
-)
+from learn.inference import video_options
 from synth.errors import UserError, as_user_error
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands, printable
@@ -60,7 +48,7 @@ def score(
     model: ModelFolder = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Folder to write; default NAME-score.")] = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
+    shrink: video_options.Shrink = 0,
     rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     title: Annotated[str, Option(help="Heading of the report.")] = "",
@@ -69,7 +57,7 @@ def score(
         str | None, Option(help="Method that the report is about. Default: the model, else physics.")
     ] = None,
     phantom: Phantom = False,
-    masks: Masks = "auto",
+    masks: video_options.Masks = "auto",
     region: Annotated[str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part.")] = "",
     json: Json = False,
 ) -> None:
@@ -135,7 +123,7 @@ def _print_result(result: Result, folder: Path) -> None:
 def estimate(
     source: Annotated[Path, Argument(help="Video, PNGs' folder, dataset, store, or .npz of flow.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
-    scale: Scale = None,
+    scale: video_options.Scale = None,
     young: Young = None,
     young_uncertainty: Annotated[
         float, Option(min=0.0, max=0.999, help="Its relative standard deviation: widens the interval.")
@@ -148,18 +136,18 @@ def estimate(
     free: Annotated[
         list[str] | None, Option(help="Span without contact, START:END in s of the video; may be repeated.")
     ] = None,
-    right: Right = None,
-    calibration: Calibration = None,
-    mm_per_unit: MmPerUnit = 1.0,
-    tissue: Tissue = None,
-    masks: Masks = "auto",
+    right: video_options.Right = None,
+    calibration: video_options.Calibration = None,
+    mm_per_unit: video_options.MmPerUnit = 1.0,
+    tissue: video_options.Tissue = None,
+    masks: video_options.Masks = "auto",
     input: Annotated[str | None, Option(help="Displacement of stored sequences, as in `learn eval`.")] = None,
     flow: Backend = "tvl1",
-    shrink: Shrink = 0,
-    rate: Rate = 10.0,
-    rest: Rest = 0,
-    pulse: Pulse = True,
-    overlay: Overlay = True,
+    shrink: video_options.Shrink = 0,
+    rate: video_options.Rate = 10.0,
+    rest: video_options.Rest = 0,
+    pulse: video_options.Pulse = True,
+    overlay: video_options.Overlay = True,
     json: Json = False,
 ) -> None:
     """Estimates the force in a video by physics, without a network, a sensor or a recording folder.
@@ -190,7 +178,7 @@ def estimate(
         living=living,
         given=options.given,
         young_uncertainty=young_uncertainty,
-        free_s=[_read_span(text) for text in free or ()],
+        free_s=[_parse_span(text) for text in free or ()],
     )
     videos, predictions = motions(source, choose_input(source, input), options), []
     for file in predict_files(by_physics, videos, source, out, overlay):
@@ -407,7 +395,7 @@ def live(
     young: Young = None,
     flow: Backend = "tvl1",
     shrink: Annotated[int, Option(min=0, max=64, help="Shrink frames first; 0: to 160 columns.")] = 0,
-    masks: Masks = "auto",
+    masks: video_options.Masks = "auto",
     tissue: Annotated[
         Path | None, Option(help="Picture, white on tissue. Default: tissue.png next to a video.")
     ] = None,
@@ -475,8 +463,8 @@ def _print_frame(frame: LiveFrame) -> None:
     print(f"frame {frame.index:5}  {timing}{force}{mark}", flush=True)
 
 
-def _read_span(text: str) -> tuple[float, float]:
-    """START:END in seconds. UserError for anything else, and if it does not run forward."""
+def _parse_span(text: str) -> tuple[float, float]:
+    """Parses START:END in seconds. UserError for anything else, and if it does not run forward."""
     start, _, end = text.partition(":")
     with as_user_error(f"--free {text}: expected START:END in seconds of the video"):
         span = float(start), float(end)

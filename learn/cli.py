@@ -12,19 +12,7 @@ import typer
 from rich.console import Console
 from typer import Argument, Option
 
-from learn.inference.video_options import (
-    Calibration,
-    Masks,
-    MmPerUnit,
-    Overlay,
-    Pulse,
-    Rate,
-    Rest,
-    Right,
-    Scale,
-    Shrink,
-    Tissue,
-)
+from learn.inference import video_options
 from synth.errors import UserError
 from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands
@@ -222,18 +210,18 @@ def predict_command(
     input: Input = None,
     young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     membrane: Annotated[MembraneState, Option(help="Of the pia, for a model with that input.")] = "unknown",
-    scale: Scale = None,
-    right: Right = None,
-    calibration: Calibration = None,
-    mm_per_unit: MmPerUnit = 1.0,
-    tissue: Tissue = None,
+    scale: video_options.Scale = None,
+    right: video_options.Right = None,
+    calibration: video_options.Calibration = None,
+    mm_per_unit: video_options.MmPerUnit = 1.0,
+    tissue: video_options.Tissue = None,
     flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
-    shrink: Shrink = 0,
-    rate: Rate = 10.0,
-    rest: Rest = 0,
-    pulse: Pulse = True,
-    masks: Masks = "auto",
-    overlay: Overlay = True,
+    shrink: video_options.Shrink = 0,
+    rate: video_options.Rate = 10.0,
+    rest: video_options.Rest = 0,
+    pulse: video_options.Pulse = True,
+    masks: video_options.Masks = "auto",
+    overlay: video_options.Overlay = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:

@@ -171,8 +171,8 @@ def page(data: Mapping[str, Any]) -> report.Page:
     sections = [report.Section("", rows), report.Section("Physics under a membrane", stated_rows)]
     if clinical_rows:
         clinical_words = (
-            "Of the job `clinical`, an intact pia in two thirds: a median of 150 mN and 4.4 mm. Its tissue "
-            "relaxes, which physics does not model.",
+            "Of the job `clinical` ([its loads](../../fem/loads/README.md)), with an intact pia in two "
+            "thirds. Its tissue relaxes, which physics does not model.",
         )
         sections.append(report.Section("Clinical loads", clinical_rows, clinical_words))
     return report.Page("Physics, network, and their fusion", data, words, sections)

@@ -185,8 +185,8 @@ def _read_stored(sequence: Sequence, source: str) -> Motion:
 
 def _video(source: Path | Array, options: VideoOptions) -> Motion:
     path = source if isinstance(source, Path) else Path("frames")
-    is_measured = options.scale_mm_per_px is None and options.second is not None
-    if options.scale_mm_per_px is None and not is_measured:
+    is_measured = options.scale_mm_per_px is None
+    if is_measured and options.second is None:
         raise UserError(f"{path}: a video needs its scale (scale_mm_per_px, --scale): mm/px, or unknown")
     if isinstance(source, np.ndarray):
         _check_frames(str(path), source)
@@ -217,7 +217,8 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     track = track_video(footage, options.settings, compare_cameras=footage.depth is not None)
     rest, findings = track.video.rest, [*track.video.findings]
     stated = options.scale_mm_per_px if footage.depth is None else footage.depth.mm_per_px
-    scale = pixel_mm("unknown" if stated is None else stated, rest.size[1])
+    assert stated is not None
+    scale = pixel_mm(stated, rest.size[1])
     if track.pair is not None and (quality := track.pair.quality) is not None:
         notes.append(quality.describe())
         findings += judge_pair(quality, None if is_measured else scale)

@@ -10,12 +10,11 @@ import numpy as np
 
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
-from synth.flow import image
 from synth.flow.recording.camera_path import CameraTracker
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
 from synth.flow.recording.mask import MaskRight
 from synth.flow.stereo.depth_camera import DepthTracker
-from synth.flow.stereo.rest import match
+from synth.flow.stereo.rest import find_depth
 from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.stereo_track import Motion3D, StereoTracker
 from synth.video.read_video import Picture, shrink_picture
@@ -105,15 +104,11 @@ class RightCamera:
         """Depth (h, w) in the last frame, NaN where unknown, by stereo matching; None: unknown."""
         if self.stereo is None or self._pair is None:
             return None
-        r, full_mask = self.stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
-        left, right = (r.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(self._pair))
+        r, everywhere = self.stereo.rectified, np.full(self._pair[0].shape[:2], True)
         try:
-            rest_match = match(left, right, full_mask, full_mask, refine=False)
+            return r.unrectify(find_depth(r, *self._pair, everywhere))
         except UserError:
             return None
-        return r.unrectify(
-            np.where(rest_match.matched, r.depth(rest_match.disparity), np.nan).astype(np.float32)
-        )
 
     def _begin(self, left: Pixels, right: Pixels, masked: Mask, hidden: Mask) -> StereoTracker:
         """Starts tracking from the rest pictures; UserError if they don't match, naming a flip that would."""

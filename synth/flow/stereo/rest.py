@@ -91,12 +91,20 @@ def measure_scale(rig: StereoRig, left: Pixels, right: Pixels) -> float:
         raise UserError(f"stereo: pictures {left.shape[:2]} and {right.shape[:2]} differ")
     rectified, middle = Rectified(rig), np.zeros((height, width), bool)
     middle[height // 4 : -height // 4, width // 4 : -width // 4] = True
+    depth = find_depth(rectified, left, right, rectified.flags(middle, 0))
+    return float(np.nanmedian(depth)) / rectified.focal
+
+
+def find_depth(rectified: Rectified, left: Pixels, right: Pixels, usable: Mask) -> Map:
+    """Depth (H, W) mm on rectified left pixels, to a sixteenth of a pixel; NaN where nothing matches.
+
+    `left`, `right`: (H, W, 3), not rectified; `usable`: rectified left pixels to match. UserError: none do.
+    """
     left_grey, right_grey = (
         rectified.picture(luminance(picture), camera) for camera, picture in enumerate((left, right))
     )
-    usable = rectified.flags(middle, 0), np.full((height, width), True)
-    rest = match(left_grey, right_grey, *usable, refine=False)
-    return float(np.median(rectified.depth(rest.disparity)[rest.matched])) / rectified.focal
+    rest = match(left_grey, right_grey, usable, np.full(usable.shape, True), refine=False)
+    return np.where(rest.matched, rectified.depth(rest.disparity), np.nan).astype(np.float32)
 
 
 def _refine(left: Map, right: Map, left_usable: Mask, right_usable: Mask, disparity: Map) -> tuple[Map, Map]:

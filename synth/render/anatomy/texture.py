@@ -117,7 +117,7 @@ class Film:
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
     reach_mm: tuple[float, float] = 0.12, 0.45  # where it ends, of the finest vessels and of wide ones
-    thin: float = 4.6  # of a film's thinness, from 0 in pools to 1 where it mirrors nothing: mean,
+    thin: float = 4.6  # of a film's thinness where nothing wets, clipped below 0 in pools, above 1: mean,
     uneven: float = 1.5  # and spread
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.05  # standard deviation of slopes where the film is thin

@@ -130,8 +130,8 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     free_density = (
         ~vein_margin * np.clip(1 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.6, 1)
     ).astype(np.float32)
-    main_arteries = _smooth(_level_radii(_keep_entering(_prune(trunks, _TRUNK_MM), extent_mm)), 1.3)
-    arteries = main_arteries = _thin_ends(_widen(main_arteries, _SEEN_TRUNK))
+    smooth_trunks = _smooth(_level_radii(_keep_entering(_prune(trunks, _TRUNK_MM), extent_mm)), 1.3)
+    arteries = main_arteries = _thin_ends(_widen(smooth_trunks, _SEEN_TRUNK))
     for growth in ARTERIOLES:
         arteries = colonisation.fill(
             arteries, _place_targets(growth, free_density, extent_mm, rng), growth, rng
