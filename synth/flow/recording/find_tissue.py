@@ -3,7 +3,8 @@
 What is still while the rest moves is no tissue. Bonded tissue moves ever less towards its rim, so that motion
 marks only a part of it, from which GrabCut (Rother et al., SIGGRAPH 2004) grows to an edge of colour. Tissue
 that fills the picture is still too, far from a gentle contact: a rim is assumed only where elastic tissue
-without one would visibly move, and if what is still has other colours.
+without one would visibly move, and if what is still has other colours. Where nothing moves, or all of the
+picture alike, as with a camera in motion, colour alone decides.
 """
 
 from __future__ import annotations
@@ -41,6 +42,11 @@ class Limits:
     max_contradiction: float = 0.04  # of it that is still though it should move: right ones 0.01, others 0.06
     max_solidity_loss: float = 0.02  # by which the outline without it may be less solid
     min_solidity: float = 0.75  # likewise, below which it is not the tissue
+    max_uniformity: float = 0.5  # median over the largest motion; around a contact 0.3, in moved pictures 0.7
+    centre: float = 0.35  # radius of an ellipse over the picture's, which colour alone takes for tissue
+    frame: float = 0.06  # width of the border over the picture's height, which it takes for surroundings
+    alone_overlap: float = 0.27  # largest overlap of colours inside and outside: openings 0.1 to 0.29
+    alone_solidity: float = 0.92  # least solidity: openings 0.925 and more, without a rim 0.79 to 0.94
 
 
 def choose_frames(footage: Footage) -> frozenset[int]:
@@ -102,14 +108,18 @@ class TissueSearch:
             significant &= motion > Limits.min_relative_motion * np.median(motion[moving])
         moving = _morph(_morph(visible & significant, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, half_width)
         core = _morph(moving, cv2.MORPH_ERODE, margin)
+        colours = _colours(self._rest.rgb)
         if not core.any():
-            return picture, _state("nothing moves by which to find it: the whole picture is assumed")
+            return self._find_by_colour(colours, "nothing moves by which to find it")
         expected = _predict_motion(motion, moving) > Limits.min_sigmas * noise
-        colours, still = _colours(self._rest.rgb), visible & (motion < noise)
+        still = visible & (motion < noise)
         is_bounded = np.mean(expected & still) > Limits.min_still_share * np.mean(visible)
         is_alike = np.minimum(*_histograms(colours, core, still)).sum() > Limits.max_overlap
         if not is_bounded or is_alike:
             if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
+                largest, median = np.percentile(motion[visible], (98, 50))
+                if median > Limits.max_uniformity * largest:
+                    return self._find_by_colour(colours, "all of the picture moves alike")
                 return picture, _state("it moves as tissue that fills the picture")
             if is_alike:
                 text = "neither motion nor colour shows a rim: the whole picture is assumed"
@@ -142,6 +152,25 @@ class TissueSearch:
             text += ", but with an uneven outline: see the picture of the masks"
             return tissue, _state(text, "warning")
         return tissue, _state(text)
+
+    def _find_by_colour(self, colours: Pixels, text: str) -> tuple[Mask, Finding]:
+        """Tissue by colour alone, from the middle of the picture to its border; the whole picture if colour
+        shows no rim either. `text` says why motion can't tell."""
+        height, width = self._rest.tissue.shape
+        y, x = np.mgrid[:height, :width]
+        centre = np.hypot(2 * x / width - 1, 2 * y / height - 1) < Limits.centre
+        inner, band = np.zeros_like(centre), max(1, round(Limits.frame * height))
+        inner[band:-band, band:-band] = True
+        core, hidden = centre & self._rest.tissue & ~self._hidden_at_rest, np.zeros_like(centre)
+        if core.any():
+            guess = np.where(core, cv2.GC_FGD, np.where(inner, cv2.GC_PR_BGD, cv2.GC_BGD)).astype(np.uint8)
+            guess = _relabel_by_colour(guess, colours, core, ~inner)
+            tissue, solidity = self._grow_region(colours, guess, core, core, hidden)
+            overlap = np.minimum(*_histograms(colours, tissue, ~tissue)).sum()
+            if overlap < Limits.alone_overlap and solidity > Limits.alone_solidity:
+                share = f"{100 * tissue.mean():.2g}% of the picture"
+                return tissue, _state(f"{text}: found by colour alone, {share}: is it right?", "warning")
+        return self._rest.tissue, _state(f"{text}: the whole picture is assumed")
 
     def _choose(
         self, colours: Pixels, guess: Pixels, core: Mask, seeds: Mask, hidden: Mask, outside: Mask

@@ -28,7 +28,7 @@ class Limits:
     large_motion_px: float = 4.0  # motion from which flow may lose tissue in view
     margin_px: int = 8  # margin around masks that is not searched
     iterations: int = 8  # iterations of the robust fit of the surface
-    min_hand_width: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
+    min_hand_width: float = 0.25  # least width of a hand over that of the picture; spatulas: 0.2
     max_tool_overlap: float = 0.1  # share on or next to what is segmented: above it an object is part of that
     tool_margin_px: int = 12  # what is next to it
     min_width_ratio: float = 1.5  # its least width over that of the tools at rest, which may be as wide

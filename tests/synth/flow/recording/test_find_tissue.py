@@ -51,6 +51,25 @@ def test_tissue_is_found(case: str) -> None:
     assert video_pass.rest.findings[0].cause == "tissue"
 
 
+SHAKE_PX = (0, 3, -2, 4, 1, -4, 2, -3, 4, 0, -2, 3)
+
+
+@pytest.mark.parametrize("shake", [0, 1], ids=["nothing moves", "all moves alike"])
+@pytest.mark.parametrize("opening", [OPENING, EVERYWHERE], ids=["opening", "edge to edge"])
+def test_colour_alone_shows_a_rim_or_none(opening: NDArray[np.bool_], shake: int) -> None:
+    """Where motion can't: nothing moves, or all of the picture alike."""
+    still = video(opening, RIM, 0, 0)
+    rest = next(iter(still.pictures())).rgb
+    search = TissueSearch(RestFrame(rest, EVERYWHERE, X.shape, 1, 0.0, ""))
+    confidence = np.full(X.shape, 0.99, np.float32)
+    for frame, px in enumerate(SHAKE_PX):
+        flow = np.full((*X.shape, 2), shake * px, np.float32)
+        search.add(FrameMotion(flow, confidence, is_rest=frame == 0))
+    tissue, finding = search.find()
+    assert (tissue & opening).sum() / (tissue | opening).sum() > 0.9
+    assert finding.severity == ("missing" if opening is EVERYWHERE else "warning")
+
+
 def test_a_blob_is_held_back() -> None:
     """What alone moves is a small disc, as an instrument is: no force is stated on it."""
     disc = np.hypot(X - 70, Y - 60) < 16
