@@ -132,6 +132,9 @@ def estimate(
     membrane_mn_per_mm: Annotated[
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
     ] = None,
+    relaxation: Annotated[
+        list[str] | None, Option(help="Stiffness that is lost, SHARE:SECONDS, as 0.45:0.5; may be repeated.")
+    ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
     free: Annotated[
         list[str] | None, Option(help="Span without contact, START:END in s of the video; may be repeated.")
@@ -179,6 +182,7 @@ def estimate(
         given=options.given,
         young_uncertainty=young_uncertainty,
         free_s=[_parse_span(text) for text in free or ()],
+        relaxation=[_parse_pair(text, "--relaxation", "SHARE:SECONDS") for text in relaxation or ()],
     )
     videos, predictions = motions(source, choose_input(source, input), options), []
     for file in predict_files(by_physics, videos, source, out, overlay):
@@ -465,12 +469,17 @@ def _print_frame(frame: LiveFrame) -> None:
 
 def _parse_span(text: str) -> tuple[float, float]:
     """Parses START:END in seconds. UserError for anything else, and if it does not run forward."""
-    start, _, end = text.partition(":")
-    with as_user_error(f"--free {text}: expected START:END in seconds of the video"):
-        span = float(start), float(end)
+    span = _parse_pair(text, "--free", "START:END in seconds of the video")
     if not span[0] < span[1]:
         raise UserError(f"--free {text}: does not end after it starts")
     return span
+
+
+def _parse_pair(text: str, option: str, form: str) -> tuple[float, float]:
+    """Parses two numbers with a colon between. UserError for anything else."""
+    first, _, second = text.partition(":")
+    with as_user_error(f"{option} {text}: expected {form}"):
+        return float(first), float(second)
 
 
 def _parse_rectangle(text: str) -> tuple[int, int, int, int] | None:

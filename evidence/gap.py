@@ -424,7 +424,7 @@ def page(data: Mapping[str, Any]) -> report.Page:
         (
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
-            "(a control) on recovered flow with the forces of other sequences, so that it learns to estimate "
+            "(control) on recovered flow with the forces of other sequences, so that it learns to estimate "
             "none: what it closes is closed without any knowledge of the force. Physics is not trained; E "
             "is stated to it, and that nothing pulsates. The ideal flow of recordings "
             "by other programs is that of the contacts alone. Errors are of the total force, as "

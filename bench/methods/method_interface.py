@@ -12,7 +12,7 @@ import numpy as np
 from bench.methods.force_mixture import ForceMixture
 from synth.arrays import Floats, Map, Mask
 from synth.flow.recording.frame_motion import FrameMotion as FrameMotion
-from synth.job.types import MembraneState
+from synth.job.types import MembraneState, PronyTerms
 
 Field = Map  # (H, W, ...) on the pixels that flow is computed on
 
@@ -39,6 +39,8 @@ class MethodContext:
     """Range of the exponent of Ogden's law, for motion beyond the linear range."""
     membrane_mn_per_mm: tuple[float, float] | None = None
     """Range of the membrane's stiffness, its thickness times its Young's modulus; None: unknown."""
+    relaxation: PronyTerms = ()
+    """Lost shares of the tissue's stiffness and times [s]; `young_kpa` is then the instantaneous one."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""
@@ -71,6 +73,18 @@ class ForceEstimate:
             return self.expected_mn
         known = self.force_mn[np.isfinite(self.force_mn)]
         return float(np.linalg.norm(known)) if len(known) else math.nan
+
+    def scale_by(self, factor: float) -> ForceEstimate:
+        """That of a force `factor` times as large."""
+        return replace(
+            self,
+            force_mn=factor * self.force_mn,
+            density=None if self.density is None else np.float32(factor) * self.density,
+            low_mn=factor * self.low_mn,
+            high_mn=factor * self.high_mn,
+            likely=None if self.likely is None else self.likely.scale_by(factor),
+            expected_mn=factor * self.expected_mn,
+        )
 
 
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, softmax
 
-from bench.methods import compliance, large_motion, posterior
+from bench.methods import compliance, large_motion, posterior, relaxation
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.large_motion import SeenMotion
@@ -118,6 +118,9 @@ NO_GAIN = Gains(np.zeros(1), np.ones(1), np.ones(1))
 class Physics:
     """A `Revising` method, see the module; without a force map its estimates are NaN until `revise`."""
 
+    share_left: Floats
+    """(T,) after `revise`: the part of each frame's elastic force that relaxation leaves; 1 without."""
+
     def __init__(self) -> None:
         self._scene: MethodContext | None = None
 
@@ -185,8 +188,21 @@ class Physics:
             self._gains = find_gains(self._scene, self._weights, self._large)
         self._contact_free = int(contact_free.sum())
         posteriors = [self._infer(frame) for frame in self._frames]
-        self._loads = [answer.load.astype(np.float32) for answer, *_ in posteriors]
-        return widen_small_forces([self._conclude(*answer, picture=False) for answer in posteriors])
+        estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
+        self.share_left = np.ones(len(estimates))
+        if terms := self._scene.relaxation:
+            elastic_mn = np.stack([estimates[k].force_mn for k in tracked])
+            self.share_left[tracked] = relaxation.measure_share_left(elastic_mn, times[tracked], terms)
+        self._loads = [
+            np.float32(share) * answer.load.astype(np.float32)
+            for share, (answer, *_) in zip(self.share_left, posteriors, strict=True)
+        ]
+        return widen_small_forces(
+            [
+                estimate.scale_by(share) if share < 1 else estimate
+                for estimate, share in zip(estimates, self.share_left, strict=True)
+            ]
+        )
 
     @property
     def view(self) -> GridView:

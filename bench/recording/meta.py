@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_
 
 from synth.errors import UserError
 from synth.job.job_writer import section_lines
-from synth.job.types import MembraneState, Section
+from synth.job.types import MembraneState, PronyTerms, Section
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Mistake
 
@@ -222,6 +222,10 @@ class Meta(Section):
     """Range of its stiffness, thickness times Young's modulus [mN/mm], e.g. of a strip that was pulled: what
     force by physics depends on most where there is a membrane. Default: not known; of an intact one 35,
     within 13 to 95 in two of three (docs/science.md, "Membrane and pulse")."""
+    relaxation: PronyTerms = ()
+    """Prony terms of the tissue [lost share of its stiffness, time in s], one or two: `young_kpa` is then the
+    instantaneous modulus. Of swine's brain [[0.45, 0.5], [0.365, 50]] (Miller & Chinzei, J. Biomech. 35,
+    2002). Default: elastic, `young_kpa` is what is left after a contact's duration."""
     poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
     """Range of the tissue's Poisson's ratio."""
     alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from bench.methods import force_interval
 from bench.methods.method_interface import ForceEstimate, MethodContext
@@ -27,12 +28,12 @@ from learn.inference.video_motion import (
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Ints, Mask
-from synth.errors import UserError, as_positive
+from synth.errors import UserError, as_positive, as_user_error
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.finding import first_fault, judge_young, problems
 from synth.flow.recording.harmonic_fit import Span
-from synth.job.types import MembraneState
+from synth.job.types import MembraneState, PronyTerms
 from synth.video.read_video import FPS
 
 
@@ -45,6 +46,7 @@ def estimate(
     young_uncertainty: float = 0.0,
     membrane: MembraneState = "unknown",
     membrane_mn_per_mm: tuple[float, float] | None = None,
+    relaxation: Sequence[tuple[float, float]] = (),
     living: bool = True,
     free_s: Sequence[Span] = (),
     tissue: str | Path | Array | None = None,
@@ -69,6 +71,8 @@ def estimate(
         young_uncertainty: its relative standard deviation, which widens the interval.
         membrane: state of the membrane (pia).
         membrane_mn_per_mm: range of its stiffness, thickness times Young's modulus; None: unknown.
+        relaxation: lost shares of the tissue's stiffness and their times [s], as of a job; `young_kpa` is
+            then the instantaneous modulus. Empty: elastic.
         living: whether heart and breath may move the tissue; False: ex vivo, or a phantom.
         free_s: begin and end [s] of spans of the video without contact, which show what else moves the
             tissue; empty: they are looked for.
@@ -98,7 +102,9 @@ def estimate(
     options = read_options(scale_mm_per_px, tissue, masks, settings, fps, rest_frame, second)
     motion = read_single(source, motions(source, choose_input(source, input), options))
     statements = young_kpa, membrane, membrane_mn_per_mm, living, options.given
-    return apply_physics(motion, *statements, young_uncertainty=young_uncertainty, free_s=free_s)
+    return apply_physics(
+        motion, *statements, young_uncertainty=young_uncertainty, free_s=free_s, relaxation=relaxation
+    )
 
 
 def choose_input(source: Path | Array, requested: str | None) -> str:
@@ -129,12 +135,13 @@ def apply_physics(
     *,
     young_uncertainty: float = 0.0,
     free_s: Sequence[Span] = (),
+    relaxation: Sequence[tuple[float, float]] = (),
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
-    `young_kpa` to `living`, `young_uncertainty`, `free_s`: as of `estimate`; `given`: as of `VideoOptions`.
-    Returns those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError for an invalid
-    modulus or stiffness, and for a span that holds no frame.
+    `young_kpa` to `living`, `young_uncertainty` to `relaxation`: as of `estimate`; `given`: as of
+    `VideoOptions`. Returns those of `learn.inference.prediction_file.FIELDS` that there are. Raises UserError
+    for an invalid modulus, stiffness or relaxation, a span without frames, and relaxation without a clock.
     """
     young = motion.young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
     young = young if motion.scale_known else None
@@ -147,6 +154,7 @@ def apply_physics(
         low, high = (as_positive("membrane_mn_per_mm", end) for end in stiffness)
         stiffness = min(low, high), max(low, high)
     extra: dict[str, Any] = {"living": living, "recovered_by": recovered_by, "membrane_mn_per_mm": stiffness}
+    extra["relaxation"] = _check_relaxation(relaxation)
     scene, physics = MethodContext(motion.tissue, scale, young, membrane, **extra), Physics()
     track = _follow(motion, scene, physics, free_s)
     findings = problems([*judge_young(young), *motion.findings])
@@ -182,6 +190,12 @@ def apply_physics(
     return out | {"notes": notes}
 
 
+def _check_relaxation(terms: Sequence[tuple[float, float]]) -> PronyTerms:
+    """The terms; UserError if they are none."""
+    with as_user_error("relaxation: one or two pairs of a lost share, below 1 together, and its time in s"):
+        return TypeAdapter(PronyTerms).validate_python(tuple(terms))
+
+
 def _follow(motion: Motion, scene: MethodContext, physics: Physics, free_s: Sequence[Span]) -> PhysicsTrack:
     """Applies physics to every frame, and again to all once spans without contact are known."""
     search, cameras = ContactFreeSearch(motion.tissue, scene.scale_mm_per_px), 1
@@ -192,6 +206,8 @@ def _follow(motion: Motion, scene: MethodContext, physics: Physics, free_s: Sequ
         time_s = math.nan if frame.time_s is None else frame.time_s
         rows.append((frame.index, time_s, frame.trusted, force_interval.find_motion(frame.flow, scene)))
         cameras = 1 if frame.motion is None else 2
+    if scene.relaxation and not np.isfinite([time_s for _, time_s, *_ in rows]).all():
+        raise UserError("relaxation: the times of the frames are not known")
     index, times, trusted, moved_mm = map(np.array, zip(*rows, strict=True))
     for start, end in free_s:
         if not (trusted & (times >= start) & (times <= end)).any():

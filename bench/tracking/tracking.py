@@ -116,7 +116,8 @@ def track_recording(
         tissue = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
         backend = name_motion(settings.backend)
         stiffness = about.membrane_mn_per_mm
-        scene = MethodContext(video.rest.tissue, mm_per_px, *tissue, backend, about.alpha, stiffness)
+        law = about.alpha, stiffness, about.relaxation
+        scene = MethodContext(video.rest.tissue, mm_per_px, *tissue, backend, *law)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         turning = SurfaceMotion(video.rest.tissue)
         search = ContactFreeSearch(video.rest.tissue, mm_per_px)
@@ -246,6 +247,8 @@ class _Forces:
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate
+            if isinstance(method, Physics) and name == self.pictured:
+                self._relax_maps(method.share_left)
         tracked = [self.estimates[k] for k in np.flatnonzero(trusted)]
         known_mn = np.where(mask_spans(stated), 0.0, np.nan)
         if about.press_s is not None and about.young_kpa is not None:
@@ -269,6 +272,15 @@ class _Forces:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.size_mn[name] = [frame[name].size_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
+
+    def _relax_maps(self, share_left: Floats) -> None:
+        """Scales the force maps of frames (T,), which were computed as elastic."""
+        self.out.snapshots = [
+            snapshot
+            if snapshot.density is None
+            else replace(snapshot, density=np.float32(share_left[snapshot.position]) * snapshot.density)
+            for snapshot in self.out.snapshots
+        ]
 
     def _bound(self, name: str, tracked: Sequence[dict[str, ForceEstimate]], moved_mm: Floats) -> None:
         """Gives physics, of this name, its calibrated interval in the tracked frames."""

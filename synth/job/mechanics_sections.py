@@ -20,7 +20,17 @@ from pydantic import (
 )
 
 from synth.fem.law_choice import LAWS, LoadRange, check_load_range, choose_law
-from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
+from synth.job.types import (
+    Direction,
+    NonNegative,
+    PlugInName,
+    Positive,
+    PronyTerms,
+    Range,
+    Section,
+    Share,
+    Vector,
+)
 from synth.plugins import STORED
 
 Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
@@ -278,9 +288,7 @@ class FemSection(Section):
     """Equilibrium in every frame, or dynamics with inertia (backward Euler)."""
     mass_kg: Positive | None = None
     """Mass of the whole volume for `time: dynamic` [kg]. Empty: 1040 kg/m3."""
-    relaxation: Annotated[
-        tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...], Field(max_length=2)
-    ] = ()
+    relaxation: PronyTerms = ()
     """Prony terms [lost share of the stiffness, time in s], one or two: E is then the instantaneous
     modulus."""
 
@@ -322,9 +330,7 @@ class FemSection(Section):
         return self
 
     @model_validator(mode="after")
-    def _law_bears_loads_and_relaxation(self, info: ValidationInfo) -> FemSection:
-        if sum(part for part, _ in self.relaxation) >= 1:
-            raise ValueError("relaxation: the lost shares add up to the whole stiffness or more")
+    def _law_bears_loads(self, info: ValidationInfo) -> FemSection:
         is_checked = info.context is not STORED and "loaded" in self.contact
         for name, loads in self.load_ranges if is_checked else ():
             check_load_range(self.of_contact("loaded").chosen_law[0], loads, self.young_kpa[0], name)

@@ -39,11 +39,23 @@ def _check_nonzero(value: tuple[float, float, float]) -> tuple[float, float, flo
     return value
 
 
+def _check_remainder(terms: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if sum(share for share, _ in terms) >= 1:
+        raise ValueError("the lost shares add up to the whole stiffness or more")
+    return terms
+
+
 Range = Annotated[tuple[Number, Number], BeforeValidator(_pair), AfterValidator(_check_order)]
 """From the lower to the upper end; a single number is both."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
+PronyTerms = Annotated[
+    tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...],
+    Field(max_length=2),
+    AfterValidator(_check_remainder),
+]
+"""Of a tissue that relaxes: lost shares of the stiffness, and their times [s]."""
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 _Weight = Annotated[FiniteFloat, Field(ge=-8, le=8)]

@@ -1,7 +1,8 @@
 """`learn predict`, `bench estimate` and `bench score` give the same forces for a video."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,40 @@ def test_stated_spans_without_contact_tell_the_tissues_own_motion_from_force() -
     assert stated[~before].min() > 5 * stated[before].max()
     with pytest.raises(synth.UserError, match="free_s"):
         apply_physics(motion, membrane="stripped", free_s=[(7.0, 9.0)])
+
+
+@pytest.mark.slow
+def test_stated_relaxation_lowers_a_held_force_as_the_stiffness_falls() -> None:
+    side, pitch, terms = 64, 0.5, ((0.45, 0.5), (0.365, 50.0))
+    y, x = pitch * (np.mgrid[:side, :side] - side / 2)
+    times = np.concatenate([[0, 0.1, 0.2], 0.5 + np.cumsum([0, 0.1, 0.4, 0.2, 1.0])])
+
+    def move(times: Sequence[float | None]) -> Iterator[FrameMotion]:
+        for k, time_s in enumerate(times):
+            press = 0.5 * (k >= 3) * np.exp(-(x**2 + y**2) / 18)
+            flow = np.stack([press, 0 * press], axis=-1).astype(np.float32)
+            yield FrameMotion(flow, np.full((side, side), 0.95, np.float32), index=k, time_s=time_s)
+
+    tissue = np.full((side, side), True)
+    motion = Motion("held", partial(move, times.tolist()), tissue, pitch, 1.0)
+    elastic, relaxed = (
+        apply_physics(motion, membrane="stripped", living=False, relaxation=stated) for stated in ((), terms)
+    )
+    share = 1 - sum(part * (1 - np.exp(-(times[3:] - times[3]) / tau)) for part, tau in terms)
+    # It is pressed between two frames, in 0.3 s.
+    ramp = sum(part * (1 - tau / 0.3 * -np.expm1(-0.3 / tau)) for part, tau in terms)
+    size = relaxed["total_force_mn"][3:] / elastic["total_force_mn"][3:]
+    assert size[0] == pytest.approx(1 - ramp, rel=0.02)
+    assert size == pytest.approx(share * size[0], rel=0.12)
+    assert (np.diff(size) < 0).all()
+    np.testing.assert_allclose(relaxed["force_mn"][3:, 0], size * elastic["force_mn"][3:, 0])
+    peaks = (forces["density"][3:].max(axis=(1, 2, 3)) for forces in (relaxed, elastic))
+    np.testing.assert_allclose(next(peaks) / next(peaks), size, rtol=1e-4)
+    with pytest.raises(synth.UserError, match="relaxation"):
+        apply_physics(motion, relaxation=[(0.6, 1.0), (0.5, 2.0)])
+    timeless = Motion("held", partial(move, [None] * len(times)), tissue, pitch, 1.0)
+    with pytest.raises(synth.UserError, match="relaxation"):
+        apply_physics(timeless, relaxation=terms)
 
 
 @pytest.mark.parametrize("span", ["3", "a:b", "4:2", ""])
