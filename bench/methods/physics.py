@@ -520,5 +520,6 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
     stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
     likeliest = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
-    verdict = "motion does not reliably show whether there is a membrane (meta.yaml's `membrane`)"
+    advice = "a living brain's is intact: state it" if scene.living else "meta.yaml's `membrane`"
+    verdict = f"motion does not reliably show whether there is a membrane ({advice})"
     return f"{verdict}: intervals hold both, {likeliest}; {rest}"

@@ -21,7 +21,7 @@ import synth
 from bench.recording.from_sequence import export_recording
 from bench.recording.meta import Meta
 from synth.dataset.store import Dataset
-from synth.job.reader import names
+from synth.job.reader import load_job, names
 from synth.job.schema import Job
 
 DOCS = generate.DOCS
@@ -102,6 +102,14 @@ def test_the_help_of_a_job_names_every_job(commands: dict[tuple[str, ...], gener
 def test_every_attribute_of_a_sequence_is_on_its_page() -> None:
     page = (DOCS / "fields.md").read_text("utf-8")
     assert not [name for name in synth.sample()[0].attrs if f"`{name}`" not in page]
+
+
+def test_recipes_state_the_size_of_every_job() -> None:
+    text = (DOCS / "recipes.md").read_text("utf-8")
+    rows = re.findall(r"^\| `([\w-]+)` \| [^|]* \| ([\d,]+) × (\d+), (\d+) × (\d+) \|", text, re.M)
+    sizes = {name: tuple(int(value.replace(",", "")) for value in values) for name, *values in rows}
+    jobs = {name: load_job(name) for name in names()}
+    assert sizes == {name: (job.sequences, job.frames, *job.render.size) for name, job in jobs.items()}
 
 
 METHODS = "physics", "network and physics", "D2FNet", "mean |flow|"  # columns of the README's table
