@@ -189,20 +189,22 @@ class Physics:
         self._contact_free = int(contact_free.sum())
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
-        self.share_left = np.ones(len(estimates))
-        if terms := self._scene.relaxation:
-            elastic_mn = np.stack([estimates[k].force_mn for k in tracked])
-            self.share_left[tracked] = relaxation.measure_share_left(elastic_mn, times[tracked], terms)
-        self._loads = [
-            np.float32(share) * answer.load.astype(np.float32)
-            for share, (answer, *_) in zip(self.share_left, posteriors, strict=True)
+        self.share_left = self._find_share_left(np.stack([estimate.force_mn for estimate in estimates]))
+        loads = [answer.load.astype(np.float32) for answer, *_ in posteriors]
+        self._loads = [np.float32(share) * load for share, load in zip(self.share_left, loads, strict=True)]
+        relaxed = [
+            estimate.scale_by(share) for estimate, share in zip(estimates, self.share_left, strict=True)
         ]
-        return widen_small_forces(
-            [
-                estimate.scale_by(share) if share < 1 else estimate
-                for estimate, share in zip(estimates, self.share_left, strict=True)
-            ]
-        )
+        return widen_small_forces(relaxed)
+
+    def _find_share_left(self, elastic_mn: Floats) -> Floats:
+        """(T,) the part of elastic forces (T, 3) that relaxation leaves; 1 in frames that aren't tracked."""
+        assert self._scene is not None
+        share, tracked, terms = np.ones(len(elastic_mn)), np.array(self._trusted), self._scene.relaxation
+        if terms and tracked.any():
+            times = np.array(self._times)[tracked]
+            share[tracked] = relaxation.measure_share_left(elastic_mn[tracked], times, terms)
+        return share
 
     @property
     def view(self) -> GridView:
