@@ -127,31 +127,37 @@ class TissueSearch:
         # An instrument that is moved to and fro cuts tissue in parts, of which some are often hidden.
         seen = picture & ~hidden & (self._count > Limits.min_seen * self._frames)
         seeds = core | _morph(seen & significant, cv2.MORPH_OPEN, half_width)
-        guess = np.where(core, cv2.GC_FGD, np.where(moving, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
         # Still, though tissue there would move.
         contradiction = _morph(expected & still & ~moving, cv2.MORPH_OPEN, 2)
-        outside = still & ~_remove_border(picture)
-        tissue, solidity = self._choose(colours, guess, core, seeds, hidden, outside)
-        if tissue[contradiction].sum() > Limits.max_contradiction * tissue.sum():  # it reaches too far
-            guess[contradiction & ~core] = cv2.GC_BGD
-            alternative = self._choose(colours, guess, core, seeds, hidden, outside)
-            if alternative[1] > solidity - Limits.max_solidity_loss:
-                tissue, solidity = alternative
-        text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
+        tissue, solidity = self._grow_from_motion(colours, moving, core, seeds, hidden, still, contradiction)
         if not is_bounded and solidity < Limits.clear_solidity:
-            text = "too little moves to find its rim: what moves is taken for it"
             hull = picture & _hull(moving)
             if hull.mean() < Limits.min_area:
                 return hull, _refuse(f"what moves is {100 * hull.mean():.2g}% of the picture")
-            return hull, _state(text, "warning")
-        if tissue.mean() < Limits.min_area:
-            return tissue, _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
-        if solidity < Limits.min_solidity:
-            return tissue, _refuse("what is found has an outline as tissue has none")
-        if solidity < Limits.clear_solidity:
-            text += ", but with an uneven outline: see the picture of the masks"
-            return tissue, _state(text, "warning")
-        return tissue, _state(text)
+            return hull, _state("too little moves to find its rim: what moves is taken for it", "warning")
+        return tissue, _judge_outline(tissue, solidity)
+
+    def _grow_from_motion(
+        self,
+        colours: Pixels,
+        moving: Mask,
+        core: Mask,
+        seeds: Mask,
+        hidden: Mask,
+        still: Mask,
+        contradiction: Mask,
+    ) -> tuple[Mask, float]:
+        """Tissue around what is `moving`, without the `contradiction` if it reaches too far into that; and
+        the solidity of its outline."""
+        guess = np.where(core, cv2.GC_FGD, np.where(moving, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        outside = still & ~_remove_border(self._rest.tissue)
+        tissue, solidity = self._choose(colours, guess, core, seeds, hidden, outside)
+        if tissue[contradiction].sum() > Limits.max_contradiction * tissue.sum():
+            guess[contradiction & ~core] = cv2.GC_BGD
+            alternative = self._choose(colours, guess, core, seeds, hidden, outside)
+            if alternative[1] > solidity - Limits.max_solidity_loss:
+                return alternative
+        return tissue, solidity
 
     def _find_by_colour(self, colours: Pixels, text: str) -> tuple[Mask, Finding]:
         """Tissue by colour alone, from the middle of the picture to its border; the whole picture if colour
@@ -204,6 +210,18 @@ def measure_border_share(tissue: Mask) -> float:
     border = np.ones(tissue.shape, bool)
     border[1:-1, 1:-1] = False
     return float((outline & border).sum() / max(outline.sum(), 1))
+
+
+def _judge_outline(tissue: Mask, solidity: float) -> Finding:
+    """What is to be said of tissue (h, w) found by motion and colour."""
+    if tissue.mean() < Limits.min_area:
+        return _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
+    if solidity < Limits.min_solidity:
+        return _refuse("what is found has an outline as tissue has none")
+    text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
+    if solidity < Limits.clear_solidity:
+        return _state(f"{text}, but with an uneven outline: see the picture of the masks", "warning")
+    return _state(text)
 
 
 def _refuse(text: str) -> Finding:
