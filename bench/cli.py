@@ -133,7 +133,8 @@ def estimate(
         tuple[float, float] | None, Option(help="Range of its thickness times Young's modulus, if known.")
     ] = None,
     relaxation: Annotated[
-        list[str] | None, Option(help="Stiffness that is lost, SHARE:SECONDS, as 0.45:0.5; may be repeated.")
+        list[str] | None,
+        Option(help="Stiffness lost, SHARE:SECONDS; --young is then instantaneous; may be repeated."),
     ] = None,
     living: Annotated[bool, Option("--living/--ex-vivo", help="Whether heart and breath move it.")] = True,
     free: Annotated[
@@ -182,7 +183,9 @@ def estimate(
         given=options.given,
         young_uncertainty=young_uncertainty,
         free_s=[_parse_span(text) for text in free or ()],
-        relaxation=[_parse_pair(text, "--relaxation", "SHARE:SECONDS") for text in relaxation or ()],
+        relaxation=[_parse_pair(text, "--relaxation", "SHARE:SECONDS") for text in relaxation]
+        if relaxation
+        else None,
     )
     videos, predictions = motions(source, choose_input(source, input), options), []
     for file in predict_files(by_physics, videos, source, out, overlay):

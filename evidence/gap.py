@@ -139,7 +139,7 @@ def list_hashes(clips: Sequence[Clip]) -> list[str]:
 
 
 def physics_errors(roots: Mapping[str, Path], test_clips: Mapping[str, Sequence[Clip]]) -> Errors:
-    """Errors of physics with E stated, and that nothing pulsates, as of `ridge_errors`.
+    """Errors of physics with E stated, and that nothing pulsates nor relaxes, as of `ridge_errors`.
 
     `roots`: dataset of a place; `test_clips`: of each place the sequences to estimate.
     """
@@ -153,7 +153,7 @@ def physics_errors(roots: Mapping[str, Path], test_clips: Mapping[str, Sequence[
             for flow, errors_mn in by_flow.items():
                 motion = read_single(sequence.path, motions(sequence.path, flow))
                 # A frame that is held back counts as an answer of no force.
-                size = np.nan_to_num(apply_physics(motion, living=False)["total_force_mn"])
+                size = np.nan_to_num(apply_physics(motion, living=False, relaxation=())["total_force_mn"])
                 errors_mn[k] = float(np.abs(size - force_size(test_clips[place][k].force)).mean())
         by_test |= {f"{place}, {flow}": errors_mn for flow, errors_mn in by_flow.items()}
     return by_test

@@ -40,7 +40,7 @@ class MethodContext:
     membrane_mn_per_mm: tuple[float, float] | None = None
     """Range of the membrane's stiffness, its thickness times its Young's modulus; None: unknown."""
     relaxation: PronyTerms = ()
-    """Lost shares of the tissue's stiffness and times [s]; `young_kpa` is then the instantaneous one."""
+    """Lost shares of the stiffness and times [s]; `young_kpa` and the membrane's are then instantaneous."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""
@@ -111,7 +111,9 @@ class Method(Protocol):
             moved_mm = scene.scale_mm_per_px * np.linalg.norm(frame.flow[scene.tissue], axis=1)
             return ForceEstimate(np.array([moved_mm.mean(), np.nan, np.nan]))
 
-    A method with a list of strings `notes` has them shown in the report, `warnings` as findings if it leads.
+    A method with `is_elastic` True takes the tissue for elastic: where relaxation is stated, it is
+    applied to its forces afterwards. A method with a list of strings `notes` has them shown in the
+    report, `warnings` as findings if it leads.
     One that has to see the whole video first is `Revising`.
     """
 

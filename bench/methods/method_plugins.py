@@ -34,6 +34,11 @@ class PluginMethod:
         with as_user_error(self._label):
             return [str(note) for note in getattr(self._method, "notes", ())]
 
+    @property
+    def is_elastic(self) -> bool:
+        """Whether the method takes the tissue for elastic; see `Method`."""
+        return bool(getattr(self._method, "is_elastic", False))
+
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
         with as_user_error(self._label):

@@ -62,6 +62,8 @@ class Model:
     def _all_notes(self) -> list[str]:
         return [] if self._estimator is None else self._estimator[1].notes + self._estimator[1].interval_notes
 
+    is_elastic = True  # see `Method`
+
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`; a monocular network uses the flow only."""
         if self._estimator is None or self._estimator[0] is not scene:

@@ -135,7 +135,7 @@ class Physics:
         self._weights = TissueWeights(first, np.ones(1), no_motion, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """See `Method`."""
+        """See `Method`; of elastic tissue, until `revise`."""
         if frame.motion is None:
             scale = np.float32(scene.scale_mm_per_px)
             moved = frame.flow * scale
@@ -189,22 +189,14 @@ class Physics:
         self._contact_free = int(contact_free.sum())
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
-        self.share_left = self._find_share_left(np.stack([estimate.force_mn for estimate in estimates]))
-        loads = [answer.load.astype(np.float32) for answer, *_ in posteriors]
-        self._loads = [np.float32(share) * load for share, load in zip(self.share_left, loads, strict=True)]
+        loads = np.stack([answer.load.astype(np.float32) for answer, *_ in posteriors])
+        flat, trusted = loads.reshape(len(loads), -1), np.array(self._trusted)
+        self.share_left = relaxation.measure_share_left(flat, times, trusted, self._scene.relaxation)
+        self._loads = list(loads * self.share_left.astype(np.float32)[:, None, None])
         relaxed = [
             estimate.scale_by(share) for estimate, share in zip(estimates, self.share_left, strict=True)
         ]
         return widen_small_forces(relaxed)
-
-    def _find_share_left(self, elastic_mn: Floats) -> Floats:
-        """(T,) the part of elastic forces (T, 3) that relaxation leaves; 1 in frames that aren't tracked."""
-        assert self._scene is not None
-        share, tracked, terms = np.ones(len(elastic_mn)), np.array(self._trusted), self._scene.relaxation
-        if terms and tracked.any():
-            times = np.array(self._times)[tracked]
-            share[tracked] = relaxation.measure_share_left(elastic_mn[tracked], times, terms)
-        return share
 
     @property
     def view(self) -> GridView:
@@ -235,7 +227,10 @@ class Physics:
             statement = f"{'at most, ' * self._weights.assumed}{statement}"
             lack = f"{shortfall} without contact is known in video time (sensor.free_s, pulse.free_s)"
             statement = f"{lack}: {statement}"
-        return [describe(self._weights, self._scene), statement]
+        lines = [describe(self._weights, self._scene), statement]
+        if self._scene.relaxation:
+            lines.append(f"relaxation, as stated, leaves {self.share_left.min():.0%} of a force or more")
+        return lines
 
     @property
     def warnings(self) -> list[str]:
@@ -522,6 +517,6 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
     stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
     likeliest = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
-    advice = "a living brain's is intact: state it" if scene.living else "meta.yaml's `membrane`"
-    verdict = f"motion does not reliably show whether there is a membrane ({advice})"
+    advice = ", a living brain's is intact unless it was opened" if scene.living else ""
+    verdict = f"motion does not reliably show whether there is a membrane (meta.yaml's `membrane`{advice})"
     return f"{verdict}: intervals hold both, {likeliest}; {rest}"

@@ -10,6 +10,7 @@ from bench.recording import recording_writer
 from synth.arguments import checked
 from synth.arrays import Floats
 from synth.checks import optics, stereo_checks
+from synth.dataset.dataset_folder import read_relaxation
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.system import checked_file
@@ -38,6 +39,8 @@ def export_recording(sequence: Sequence, folder: str | Path, instrument: int | N
         "specimen": f"anatomy {sequence.attrs.get('anatomy_id', sequence.index)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
+    if relaxation := read_relaxation(sequence.path):
+        meta_keys["relaxation"] = [list(term) for term in relaxation]
     with checked_file.folder_of(Path(folder)) as part:
         (part / "masks").mkdir()
         _write_pictures(sequence, "rgb", part / "frames")

@@ -223,9 +223,9 @@ class Meta(Section):
     force by physics depends on most where there is a membrane. Default: not known; of an intact one 35,
     within 13 to 95 in two of three (docs/science.md, "Membrane and pulse")."""
     relaxation: PronyTerms = ()
-    """Prony terms of the tissue [lost share of its stiffness, time in s], one or two: `young_kpa` is then the
-    instantaneous modulus. Of swine's brain [[0.45, 0.5], [0.365, 50]] (Miller & Chinzei, J. Biomech. 35,
-    2002). Default: elastic, `young_kpa` is what is left after a contact's duration."""
+    """Prony terms of the tissue [lost share of its stiffness, time in s], one or two: `young_kpa`, and a
+    membrane's stiffness, are then instantaneous. Of swine's brain [[0.45, 0.5], [0.365, 50]] (Miller &
+    Chinzei, J. Biomech. 35, 2002). Default: elastic, `young_kpa` is what a contact's duration leaves."""
     poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
     """Range of the tissue's Poisson's ratio."""
     alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)

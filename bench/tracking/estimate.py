@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from bench.methods import force_interval
 from bench.methods.method_interface import ForceEstimate, MethodContext
@@ -28,7 +28,7 @@ from learn.inference.video_motion import (
 from learn.uncertainty.intervals import LEVEL
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Ints, Mask
-from synth.errors import UserError, as_positive, as_user_error
+from synth.errors import UserError, as_positive
 from synth.flow.estimator import Estimator
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.finding import first_fault, judge_young, problems
@@ -46,7 +46,7 @@ def estimate(
     young_uncertainty: float = 0.0,
     membrane: MembraneState = "unknown",
     membrane_mn_per_mm: tuple[float, float] | None = None,
-    relaxation: Sequence[tuple[float, float]] = (),
+    relaxation: Sequence[tuple[float, float]] | None = None,
     living: bool = True,
     free_s: Sequence[Span] = (),
     tissue: str | Path | Array | None = None,
@@ -71,8 +71,8 @@ def estimate(
         young_uncertainty: its relative standard deviation, which widens the interval.
         membrane: state of the membrane (pia).
         membrane_mn_per_mm: range of its stiffness, thickness times Young's modulus; None: unknown.
-        relaxation: lost shares of the tissue's stiffness and their times [s], as of a job; `young_kpa` is
-            then the instantaneous modulus. Empty: elastic.
+        relaxation: lost shares of the tissue's stiffness and their times [s], as of a job; `young_kpa`, and a
+            membrane's stiffness, are then instantaneous. None: the data's, else elastic, as if empty.
         living: whether heart and breath may move the tissue; False: ex vivo, or a phantom.
         free_s: begin and end [s] of spans of the video without contact, which show what else moves the
             tissue; empty: they are looked for.
@@ -135,7 +135,7 @@ def apply_physics(
     *,
     young_uncertainty: float = 0.0,
     free_s: Sequence[Span] = (),
-    relaxation: Sequence[tuple[float, float]] = (),
+    relaxation: Sequence[tuple[float, float]] | None = None,
 ) -> dict[str, Any]:
     """Force of every frame of a video by `Physics`, with its calibrated interval.
 
@@ -154,7 +154,7 @@ def apply_physics(
         low, high = (as_positive("membrane_mn_per_mm", end) for end in stiffness)
         stiffness = min(low, high), max(low, high)
     extra: dict[str, Any] = {"living": living, "recovered_by": recovered_by, "membrane_mn_per_mm": stiffness}
-    extra["relaxation"] = _check_relaxation(relaxation)
+    extra["relaxation"] = motion.relaxation if relaxation is None else _check_relaxation(relaxation)
     scene, physics = MethodContext(motion.tissue, scale, young, membrane, **extra), Physics()
     track = _follow(motion, scene, physics, free_s)
     findings = problems([*judge_young(young), *motion.findings])
@@ -192,8 +192,11 @@ def apply_physics(
 
 def _check_relaxation(terms: Sequence[tuple[float, float]]) -> PronyTerms:
     """The terms; UserError if they are none."""
-    with as_user_error("relaxation: one or two pairs of a lost share, below 1 together, and its time in s"):
+    try:
         return TypeAdapter(PronyTerms).validate_python(tuple(terms))
+    except (ValidationError, TypeError):
+        form = "one or two pairs of a lost share, above 0 and below 1 together, and its time in s"
+        raise UserError(f"relaxation {terms}: give {form}") from None
 
 
 def _follow(motion: Motion, scene: MethodContext, physics: Physics, free_s: Sequence[Span]) -> PhysicsTrack:

@@ -15,6 +15,7 @@ from bench.methods.force_fusion import Fusion
 from bench.methods.force_interval import VideoEstimates
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
 from bench.methods.physics import Physics
+from bench.methods.relaxation import relax_estimates
 from bench.recording.footage import as_footage
 from bench.recording.recording_folder import Recording
 from bench.sensor.alignment import align_sensor
@@ -247,8 +248,9 @@ class _Forces:
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate
-            if isinstance(method, Physics) and name == self.pictured:
-                self._relax_maps(method.share_left)
+        shares_left = self._relax(times, trusted)
+        if self.pictured in shares_left:
+            self._relax_maps(shares_left[self.pictured])
         tracked = [self.estimates[k] for k in np.flatnonzero(trusted)]
         known_mn = np.where(mask_spans(stated), 0.0, np.nan)
         if about.press_s is not None and about.young_kpa is not None:
@@ -272,6 +274,20 @@ class _Forces:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.size_mn[name] = [frame[name].size_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
+
+    def _relax(self, times: Floats, trusted: Mask) -> dict[str, Floats]:
+        """Relaxes the forces of methods for elastic tissue, where relaxation is stated; the shares (T,) of
+        each method's forces that are left."""
+        shares = dict[str, Floats]()
+        for name, method in self.methods.items() if self.scene.relaxation else ():
+            if isinstance(method, Physics):
+                shares[name] = method.share_left
+            elif getattr(method, "is_elastic", False):
+                estimates = [frame[name] for frame in self.estimates]
+                relaxed, shares[name] = relax_estimates(estimates, times, trusted, self.scene.relaxation)
+                for frame, estimate in zip(self.estimates, relaxed, strict=True):
+                    frame[name] = estimate
+        return shares
 
     def _relax_maps(self, share_left: Floats) -> None:
         """Scales the force maps of frames (T,), which were computed as elastic."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from learn.data.clips import FIELDS, RECOVERED, check_readable, has_depth
 from synth.arrays import Array, Floats, Mask
+from synth.dataset.dataset_folder import read_relaxation
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError, as_positive
 from synth.flow.estimator import name_motion
@@ -26,6 +27,7 @@ from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.rest import measure_scale
 from synth.flow.stereo.rig import StereoRig
 from synth.flow.stereo.stereo_track import Motion3D
+from synth.job.types import PronyTerms
 from synth.system import checked_file
 from synth.video import file_numbers
 from synth.video import read_video as video
@@ -47,6 +49,7 @@ class Motion:
     recovered_by: str = ""  # estimator and version of recovered motion; empty if unknown
     notes: tuple[str, ...] = ()  # on the processing
     findings: tuple[Finding, ...] = ()
+    relaxation: PronyTerms = ()  # lost shares of the tissue's stiffness and times [s]; empty: none is known
     scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
 
 
@@ -178,6 +181,7 @@ def _read_stored(sequence: Sequence, source: str) -> Motion:
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
         young_kpa=sequence.attrs["young_kpa"],
+        relaxation=read_relaxation(sequence.path),
         recovered_by=sequence.recovered_by if source in RECOVERED else "",
         force_mn=np.linalg.norm(sequence.read_whole("force"), axis=1) if "force" in sequence else None,
     )

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from synth.formats import FOLDER, check_format
 from synth.job import identity, job_writer
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.schema import Job
+from synth.job.types import PronyTerms
 from synth.plugins import STORED
 from synth.system import checked_file, file_lock
 from synth.system.checked_file import write_whole as write_whole
@@ -201,6 +203,13 @@ class Folder:
         for name in (_NAME, "job.yaml", "index.parquet"):
             (self.root / name).unlink(missing_ok=True)
         shutil.rmtree(self.state)
+
+
+@lru_cache
+def read_relaxation(sequence: Path) -> PronyTerms:
+    """Relaxation of a stored sequence's tissue, by its dataset's job; empty without a dataset around it."""
+    folder = Folder(sequence.parent)
+    return folder.job().fem.relaxation if folder.is_begun else ()
 
 
 @contextmanager

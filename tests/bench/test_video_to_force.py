@@ -18,6 +18,7 @@ import bench.cli
 import learn.cli
 import synth
 from bench.methods import comparison
+from bench.methods.relaxation import measure_share_left
 from bench.tracking.estimate import apply_physics
 from learn.inference.video_motion import Motion
 from synth.flow.recording.frame_motion import FrameMotion
@@ -137,6 +138,42 @@ def test_stated_relaxation_lowers_a_held_force_as_the_stiffness_falls() -> None:
         apply_physics(timeless, relaxation=terms)
 
 
+class Sine:
+    """A force that comes and goes, whatever is seen."""
+
+    def __init__(self, is_elastic: bool) -> None:
+        self.is_elastic = is_elastic
+
+    def __call__(self, frame: FrameMotion, scene: bench.MethodContext, picture: bool) -> bench.ForceEstimate:
+        force = np.array([10 * np.sin(1 + (frame.time_s or 0)), 0, 5.0])
+        density = np.full(scene.tissue.shape, force[0], np.float32) if picture else None
+        return bench.ForceEstimate(force, density, low_mn=1.0, high_mn=2.0)
+
+
+def test_relaxation_is_applied_to_methods_for_elastic_tissue_alone(make: Maker) -> None:
+    terms = ((0.45, 0.5), (0.365, 50.0))
+    folder = make(frames=10, meta={"relaxation": [list(term) for term in terms]})
+    settings = bench.Settings(backend="dis", rate_hz=None, pulse=False)
+    methods = {"elastic": Sine(True), "own": Sine(False)}
+    tracked = bench.score(folder, methods=methods, main="elastic", settings=settings, baselines=False).tracked
+    own, elastic = (np.stack(tracked.force_mn[name]) for name in ("own", "elastic"))
+    share = measure_share_left(own, np.array(tracked.time_s), np.array(tracked.trusted), terms)
+    assert 0.4 < share.min() < 0.8
+    np.testing.assert_allclose(elastic, share[:, None] * own)
+    np.testing.assert_allclose(tracked.bounds["elastic"], np.outer(share, [1.0, 2.0]))
+    for snapshot in tracked.snapshots:
+        assert snapshot.density is not None
+        assert snapshot.density == pytest.approx(elastic[snapshot.position, 0], rel=1e-5)
+
+
+@pytest.mark.parametrize("terms", ["0.4", "0.4:-1", "0.6:1 0.5:2", "0.1:1 0.1:2 0.1:3"])
+def test_relaxation_that_is_none_is_refused(terms: str, tmp_path: Path) -> None:
+    words = [word for term in terms.split() for word in ("--relaxation", term)]
+    source = next(iter(synth.sample())).path
+    run(bench.cli.app, "estimate", source, *words, "-o", tmp_path / "forces", code=2)
+    assert not (tmp_path / "forces").exists()
+
+
 @pytest.mark.parametrize("span", ["3", "a:b", "4:2", ""])
 def test_a_span_that_cannot_be_read_is_refused(span: str, tmp_path: Path) -> None:
     words = [next(iter(synth.sample())).path, "--free", span, "-o", tmp_path / "forces"]
@@ -146,10 +183,15 @@ def test_a_span_that_cannot_be_read_is_refused(span: str, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_estimate_and_score_agree_in_force_and_interval(make: Maker, tmp_path: Path) -> None:
-    folder = make(frames=16, footage="mp4", meta={"tissue": "ex-vivo", "poisson": [0.4, 0.49]})
+    folder = make(
+        frames=16,
+        footage="mp4",
+        meta={"tissue": "ex-vivo", "poisson": [0.4, 0.49], "relaxation": [[0.45, 0.5]]},
+    )
     cv2.imwrite(str(folder / "tissue.png"), np.full((96, 128), 255, np.uint8))
     words = [folder / "video.mp4", "--scale", 0.2, "--tissue", folder / "tissue.png", "--young", 1.0]
-    run(bench.cli.app, "estimate", *words, "--membrane", "stripped", "--ex-vivo", "-o", tmp_path / "forces")
+    words += ["--relaxation", "0.45:0.5", "--membrane", "stripped", "--ex-vivo"]
+    run(bench.cli.app, "estimate", *words, "-o", tmp_path / "forces")
     run(bench.cli.app, "score", folder, "-o", tmp_path / "score")
     curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
     with np.load(tmp_path / "forces" / "video.npz") as prediction:
@@ -165,6 +207,7 @@ def test_estimate_and_score_agree_in_force_and_interval(make: Maker, tmp_path: P
         low, high, force = (prediction[name] for name in ("low_mn", "high_mn", "total_force_mn"))
     about: dict[str, Any] = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "membrane": "stripped"}
     about |= {"living": False, "tissue": folder / "tissue.png"}
+    about["relaxation"] = [(0.45, 0.5)]
     widened = bench.estimate(folder / "video.mp4", young_uncertainty=0.4, **about)
     is_finite = np.isfinite(high)
     added = 1.645 * 0.4 * force[is_finite]

@@ -169,11 +169,12 @@ class TissueSearch:
         inner[band:-band, band:-band] = True
         core, hidden = centre & self._rest.tissue & ~self._hidden_at_rest, np.zeros_like(centre)
         if core.any():
-            guess = np.where(core, cv2.GC_FGD, np.where(inner, cv2.GC_PR_BGD, cv2.GC_BGD)).astype(np.uint8)
+            guess = np.where(core, cv2.GC_FGD, cv2.GC_PR_BGD).astype(np.uint8)
             guess = _relabel_by_colour(guess, colours, core, ~inner)
             tissue, solidity = self._grow_region(colours, guess, core, core, hidden)
             overlap = np.minimum(*_histograms(colours, tissue, ~tissue)).sum()
-            if overlap < Limits.alone_overlap and solidity > Limits.alone_solidity:
+            is_large = tissue.mean() > Limits.min_area
+            if is_large and overlap < Limits.alone_overlap and solidity > Limits.alone_solidity:
                 share = f"{100 * tissue.mean():.2g}% of the picture"
                 return tissue, _state(f"{text}: found by colour alone, {share}: is it right?", "warning")
         return self._rest.tissue, _state(f"{text}: the whole picture is assumed")

@@ -46,7 +46,7 @@ def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(pea
     assert find_messages(rigid_motion, np.where(ROD, depth - 6, depth), masked=True) == []
 
 
-@pytest.mark.parametrize(("half_width", "reported"), [(8, False), (24, True)])
+@pytest.mark.parametrize(("half_width", "reported"), [(8, False), (16, False), (24, True)])
 def test_a_detected_instrument_is_no_foreign_object_but_a_hand_is(half_width: int, reported: bool) -> None:
     tool = (np.abs(Y - 60) < half_width) & (X < 90)
     search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=False)
