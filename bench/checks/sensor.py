@@ -197,6 +197,7 @@ class SensorMotion:
     rest_mn: Floats | None = None  # (3,) the sensor's force at the rest frame
     noise_mn: float = 0.0  # of the sensor without contact; 0 if unknown
     pulsates: bool = False  # the tissue moves by itself
+    may_pulsate: bool = False  # it may, as far as is stated
     calibrated: bool = True  # the interval has the level that it states
     drift: Drift | None = None  # of its zero, against the video; None: unknown, or removed
 
@@ -254,6 +255,7 @@ def find_sensor_motion(
         next((force for force in sensor.axes_mn[:2] if np.isfinite(force).all()), None),  # it may start later
         sensor.noise_floor_mn,
         bool(tracked.pulse),
+        recording.meta.may_pulsate,
         main not in tracked.uncalibrated,
         sensor.drift,
     )
@@ -284,7 +286,10 @@ def check_constant(sensor: SensorMotion) -> list[Finding]:
     for k, values in enumerate(sensor.axes_mn.T):
         for run in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
             is_constant = len(run) > _CONSTANT and values[run[0]] and np.ptp(values)
-            if is_constant and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
+            # A held force without noise is constant in all components, and living tissue moves by itself.
+            is_noiseless = sensor.noise_mn == 0 and not np.ptp(sensor.axes_mn[run], axis=0).any()
+            is_held = sensor.may_pulsate and is_noiseless
+            if is_constant and not is_held and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
                 span = f"{t[run[0]]:.3g} to {t[run[-1]]:.3g} s"
                 fault = f"f{'xyz'[k]}_n is constant at {values[run[0]]:.3g} mN from {span}"
                 return [Finding("warning", "sensor", f"{fault} while the tissue moves: saturated, or stuck?")]
