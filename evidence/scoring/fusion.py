@@ -24,10 +24,10 @@ from evidence.paired_means import mean_of
 from evidence.study import Study
 from learn.inference.predict import load_model
 from learn.inference.shipped_networks import NAMES
+from synth.dataset.dataset_folder import read_relaxation
 from synth.dataset.store import Dataset
 from synth.dataset.store import Sequence as Stored
 from synth.flow.stereo.stereo_track import Motion3D
-from synth.job.reader import load_job
 from synth.job.types import MembraneState
 
 Case = dict[str, Any]  # input of the methods: `cameras`, and what is stated, one of `_STATED`
@@ -56,7 +56,7 @@ def measure(
 def _score(data: Path, work: Path, every: int) -> list[dict[str, Any]]:
     """Rows of one dataset; see `measure`."""
     rows = []
-    relaxation = load_job(str(data / "job.yaml")).fem.relaxation
+    relaxation = read_relaxation(Dataset(data).paths[0])
     cases = (_LIVING, *_STATED, _WITH_RELAXATION) if relaxation else (_LIVING, *_STATED)
     for cameras, stated in product((1, 2), cases):
         model = Model(load_model(NAMES[0])) if cameras == 2 else None  # none is shipped for one camera

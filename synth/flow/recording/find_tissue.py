@@ -150,7 +150,7 @@ class TissueSearch:
         """Tissue around what is `moving`, without the `contradiction` if it reaches too far into that; and
         the solidity of its outline."""
         guess = np.where(core, cv2.GC_FGD, np.where(moving, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
-        outside = still & ~_remove_border(self._rest.tissue)
+        outside = still & ~_remove_border(self._rest.tissue, 2 * Limits.half_width)
         tissue, solidity = self._choose(colours, guess, core, seeds, hidden, outside)
         if tissue[contradiction].sum() > Limits.max_contradiction * tissue.sum():
             guess[contradiction & ~core] = cv2.GC_BGD
@@ -165,8 +165,7 @@ class TissueSearch:
         height, width = self._rest.tissue.shape
         y, x = np.mgrid[:height, :width]
         centre = np.hypot(2 * x / width - 1, 2 * y / height - 1) < Limits.centre
-        inner, band = np.zeros_like(centre), max(1, round(Limits.frame * height))
-        inner[band:-band, band:-band] = True
+        inner = _remove_border(self._rest.tissue, Limits.frame)
         core, hidden = centre & self._rest.tissue & ~self._hidden_at_rest, np.zeros_like(centre)
         if core.any():
             guess = np.where(core, cv2.GC_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -268,9 +267,9 @@ def _relabel_by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask
     return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, labels).astype(np.uint8)
 
 
-def _remove_border(picture: Mask) -> Mask:
-    """The picture without a band along its border."""
-    inside, band = np.zeros_like(picture), max(1, round(2 * Limits.half_width * len(picture)))
+def _remove_border(picture: Mask, width: float) -> Mask:
+    """The picture without a band along its border, of this width over its height."""
+    inside, band = np.zeros_like(picture), max(1, round(width * len(picture)))
     inside[band:-band, band:-band] = True
     return inside
 

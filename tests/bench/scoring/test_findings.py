@@ -170,9 +170,11 @@ def test_a_stuck_component_is_found_and_a_force_held_on_living_tissue_is_none(
     may_pulsate: bool, noise_mn: float
 ) -> None:
     t = np.arange(0, 4, 0.1)
-    held = np.clip(t - 1, 0, 1)[:, None] * np.array([3.0, -1.0, 5.0])  # without noise, as of a render
-    moved = held[:, 0] + 1.5 * np.sin(7 * t)
-    saturated = np.column_stack([held[:, :2] + 0.1 * np.sin(9 * t)[:, None], np.minimum(held[:, 2], 4.0)])
-    for axes, is_found in ((held, noise_mn > 0 or not may_pulsate), (saturated, True)):
+    steady_force = np.clip(t - 1, 0, 1)[:, None] * np.array([3.0, -1.0, 5.0])  # without noise, as of a render
+    moved = steady_force[:, 0] + 1.5 * np.sin(7 * t)
+    saturated = np.column_stack(
+        [steady_force[:, :2] + 0.1 * np.sin(9 * t)[:, None], np.minimum(steady_force[:, 2], 4.0)]
+    )
+    for axes, is_found in ((steady_force, noise_mn > 0 or not may_pulsate), (saturated, True)):
         sensor = SensorMotion(t, axes, moved, may_pulsate=may_pulsate, noise_mn=noise_mn)
         assert bool(sensor_checks.check_constant(sensor)) is is_found
