@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -49,31 +50,36 @@ def measure(
     recordings: Path,
     mechanics_python: Path,
     pictures_python: Path,
-    kinds: str = ",".join(KINDS),
-    count: int = 3,
+    kinds: str = "plain,plain,membrane,membrane,pulse,two",
+    seeds: str = "907,20261129",
     seconds: float = 8.0,
     fps: float = 3.0,
-    spp: int = 24,
-    seed: int = 601,
+    spp: int = 16,
     results: Path = report.RESULTS / "learn/foreign",
 ) -> None:
     """Makes recordings in the folder `recordings`, and scores them into `results`.
 
-    `mechanics_python`, `pictures_python`: a Python with felupe and pypardiso, and one with bpy; `count`: of
-    each kind; `spp`: light paths a pixel.
+    `mechanics_python`, `pictures_python`: a Python with felupe and pypardiso, and one with bpy; `kinds`: of
+    the recordings of each of `seeds`, whose second has numbers from 10 on; `spp`: light paths a pixel.
     """
     folders = {cameras: list[Path]() for cameras in FOLDERS}
-    for kind, index in product(kinds.split(","), range(count)):
-        stereo, mono = (recordings / FOLDERS[cameras] / f"{kind}-{index}" for cameras in (2, 1))
+    for (part_number, seed), (index, kind) in product(enumerate(seeds.split(",")), _number(kinds.split(","))):
+        name = f"{kind}-{10 * part_number + index}"
+        stereo, mono = (recordings / FOLDERS[cameras] / name for cameras in (2, 1))
         if not stereo.exists():
             with checked_file.folder_of(stereo) as part:
-                rng = np.random.default_rng([seed, KINDS.index(kind), index])
+                rng = np.random.default_rng([int(seed), KINDS.index(kind), index])
                 record(part, stereo.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
         copy_left(stereo, mono)
         folders[2].append(stereo)
         folders[1].append(mono)
     for cameras, paths in folders.items():
         score_and_pool(paths, cameras, results / FOLDERS[cameras])
+
+
+def _number(kinds: Sequence[str]) -> list[tuple[int, str]]:
+    """Each kind with its number among those of the same kind."""
+    return [(kinds[:k].count(kind), kind) for k, kind in enumerate(kinds)]
 
 
 def record(
