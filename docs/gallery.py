@@ -58,6 +58,7 @@ _LOADS: dict[str, Settings] = {
         "fem.force_mn": 300.0,
     },
 }
+_RECIPES = "endoscope", "ex-vivo-calf", "in-vivo", "paper", "stereo"
 _CAPTION_PX = 24
 
 
@@ -87,6 +88,8 @@ def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, qua
     job = change_job(load_job("randomized"), {"render.stereo_mm": 0, "store.without": (), "sequences": 48})
     tiles = [_ready(at_rest(job, index)) for index in range(48)]
     _save(out / "gallery-randomized.webp", [tiles[k : k + 8] for k in range(0, 48, 8)], quality)
+    for name in _RECIPES:
+        cv2.imwrite(str(out / f"recipes/{name}.jpg"), _recipe(name)[..., ::-1])
 
 
 def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
@@ -112,6 +115,14 @@ def _load(settings: Settings, name: str, frames: int = 25) -> list[Pixels]:
     top = scene.strongest
     rising = [int(np.argmin(np.abs(force[: top + 1] - share * force[top]))) for share in (0, 1 / 3, 2 / 3, 1)]
     return [_with_caption(scene.frame(t).rgb, f"{name}: {force[t]:.0f} mN") for t in rising]
+
+
+def _recipe(name: str) -> Pixels:
+    """The frame of the largest force of a job's first sequence, of two cameras side by side."""
+    settings: Settings = {"frames": 12, "seed": 2, "render.size": (256, 192), "anatomy.vertices": 20_000}
+    scene = simulate(change_job(load_job(name), settings))
+    shot = scene.frame(scene.strongest)
+    return shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
 
 
 def _with_caption(shot: Pixels, caption: str) -> Pixels:
