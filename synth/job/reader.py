@@ -27,7 +27,7 @@ def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
     Args:
-        source: path of a job file, or one of `names()`. A path wins when it exists. overrides:
+        source: path of a job file, or one of `names()`. A file wins when it exists. overrides:
         `section.key=value`, the value in YAML. Paths in them are relative to the working directory, those in
         a job file to the file.
 
@@ -45,7 +45,8 @@ def as_job(job: Job | str | Path) -> Job:
 
 def read_source(source: str) -> tuple[str, str, Path]:
     """Text of a job file or named job, its name in messages, and the folder of its relative paths."""
-    if os.path.lexists(source):
+    # `synth render mission -o mission` is repeated, and continued, next to its own folder.
+    if os.path.lexists(source) and not (source in names() and os.path.isdir(source)):
         text = checked_file.read_text(Path(source), checked_file.LARGEST_YAML)
         return text, source, Path(source).resolve().parent
     if source not in names():

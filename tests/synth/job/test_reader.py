@@ -93,3 +93,18 @@ def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data
 
 def test_every_family_has_its_ranges() -> None:
     assert get_args(Family) == tuple(FAMILIES)
+
+
+def test_a_named_job_is_found_beside_a_folder_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`synth render mission -o mission` is continued where it was begun; a file of that name is read."""
+    usual = reader.load_job("mission")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mission").mkdir()
+    assert reader.load_job("mission") == usual
+    (tmp_path / "tiny").write_text("sequences: 77\n")
+    assert reader.load_job("tiny").sequences == 77
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError):
+        reader.load_job("folder")
