@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.special import log_softmax, softmax
 
 from bench.methods import compliance, large_motion, posterior, relaxation
@@ -30,18 +30,14 @@ from bench.methods.method_interface import (
 from bench.methods.posterior import LoadBasis, Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
-from learn.inference.grid_placement import GridPlacement, PlacementRule
-from synth.arrays import Floats, Ints, Map, Mask
+from synth.arrays import Floats, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
-_WINDOW = Grid(GRID.size, 2 * OPENING_MM)  # on which loads are sought
-_ON_CONTACT = PlacementRule(near=0.1, off_centre=0.125, still_px=0.2, reach=0.25)
-
-Offset = tuple[int, int]
-"""Of a frame's loads from the tissue's centre, in nodes along x and y."""
+_NEAR_MM = 2.0  # deviation of means over the motion whose largest is called the strongest
+MOVING_MM = 0.05  # strongest motion that is none
 
 
 @dataclass(frozen=True)
@@ -133,14 +129,10 @@ class Physics:
     def _begin(self, scene: MethodContext, components: int) -> None:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
-        # On tissue wider than an opening a contact may be farther from the centre than loads are sought.
         is_wide = {tissue.edge for tissue in candidate_tissues(scene)} == {"free"}
-        self._is_edge_seen = is_edge_seen(scene)
-        self._placement = (
-            GridPlacement(scene.tissue, scene.scale_mm_per_px, _WINDOW, _ON_CONTACT) if is_wide else None
-        )
-        self._views: dict[Offset, GridView] = {(0, 0): self._view}
-        self._offsets: list[Offset] = []
+        self._strongest = (
+            (0.0, 0.0) if is_wide else None
+        )  # largest mean motion, and its distance from the middle
         self._frames: list[Observation] = []
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, no_motion = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
@@ -158,19 +150,15 @@ class Physics:
             moved, spread = frame.motion.motion, frame.motion.deviation
         if self._scene is not scene:
             self._begin(scene, moved.shape[2])
-        offset, fields = self._place(frame), (moved.transpose(2, 0, 1), spread.transpose(2, 0, 1))
-        view = self._views[offset]
-        moved, spread = (view.mean(field) for field in fields)
-        observation = observe(moved, spread, view.mask)
+        moved, spread = (self._view.mean(field.transpose(2, 0, 1)) for field in (moved, spread))
+        observation = observe(moved, spread, self._view.mask)
         self._frames.append(observation)
-        self._offsets.append(offset)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
         if frame.trusted:
-            if self._is_edge_seen and view is not self._view:  # an opening is about the tissue's centre
-                view = self._view
-                moved, spread = (view.mean(field) for field in fields)
-            surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
+            surface = large_motion.measure_motion(moved, spread, self._view.mask, GRID)
+            if self._strongest is not None:
+                self._strongest = max(self._strongest, find_strongest(moved, self._view.mask))
             least_slope = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, least_slope):
                 self._large.append((observation, surface))
@@ -180,18 +168,6 @@ class Physics:
             self._weighed_mm = observation.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
         return self._conclude(*self._infer(observation), picture=picture)
-
-    def _place(self, frame: FrameMotion) -> Offset:
-        """Where loads are sought in a frame: on tissue wider than an opening where it moves most."""
-        if self._placement is None or not frame.trusted:
-            return self._offsets[-1] if self._offsets else (0, 0)
-        view, place = self._view, self._placement.place(frame.flow, frame.confidence)
-        node_px = compliance.NODE_MM / view.scale_mm_per_px
-        x, y = (round((end - start) / node_px) for start, end in zip(view.centre_px, place, strict=True))
-        if (x, y) not in self._views:
-            centre_px = view.centre_px[0] + x * node_px, view.centre_px[1] + y * node_px
-            self._views[x, y] = GridView(view.tissue, view.scale_mm_per_px, GRID, centre_px)
-        return x, y
 
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
@@ -222,8 +198,8 @@ class Physics:
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
         loads = np.stack([answer.load.astype(np.float32) for answer, *_ in posteriors])
-        joined, trusted = join_loads(loads, self._offsets), np.array(self._trusted)
-        self.share_left = relaxation.measure_share_left(joined, times, trusted, self._scene.relaxation)
+        flat, trusted = loads.reshape(len(loads), -1), np.array(self._trusted)
+        self.share_left = relaxation.measure_share_left(flat, times, trusted, self._scene.relaxation)
         self._loads = list(loads * self.share_left.astype(np.float32)[:, None, None])
         relaxed = [
             estimate.scale_by(share) for estimate, share in zip(estimates, self.share_left, strict=True)
@@ -238,12 +214,11 @@ class Physics:
     def map_forces(self) -> Map:
         """(T, N, N) magnitude of the force density in `GRID`'s cells [kPa], of the last `revise`."""
         assert self._scene is not None
-        young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
+        young, middle = self._scene.young_kpa or UNKNOWN_YOUNG_KPA, ((GRID.size - 1) / 2,) * 2
         maps = []
-        for load, offset in zip(self._loads, self._offsets, strict=True):
+        for load in self._loads:
             lattice, step = self._lattice(load)
-            x, y = ((GRID.size - 1) / 2 + number * step / GRID.pitch_mm for number in offset)
-            maps.append(to_image(young * lattice, (GRID.size,) * 2, (x, y), GRID.pitch_mm, step))
+            maps.append(to_image(young * lattice, (GRID.size,) * 2, middle, GRID.pitch_mm, step))
         return np.stack(maps)
 
     @property
@@ -268,7 +243,19 @@ class Physics:
     @property
     def warnings(self) -> list[str]:
         """What its result must not be taken for."""
-        if self._scene is None or not self._gains.unsolved:
+        if self._scene is None:
+            return []
+        size_mm, far_mm = self._strongest or (0.0, 0.0)
+        least_mm = TISSUES.living_mm if self._scene.living else MOVING_MM
+        if size_mm > least_mm and far_mm > posterior.MODEL.reach_mm:
+            fault = f"tissue moves most {far_mm:.0f} mm from its middle, where loads aren't sought"
+            cure = "their force may be three times as large: draw tissue.png around the contact"
+            return [f"{fault}; {cure}", *self._large_warnings]
+        return self._large_warnings
+
+    @property
+    def _large_warnings(self) -> list[str]:
+        if not self._gains.unsolved:
             return []
         fault = "the surface is bent beyond the range of the linear inverse"
         if self._is_beyond:
@@ -309,33 +296,34 @@ class Physics:
         return answer, low_gain, high_gain
 
     def _picture(self, load: Floats) -> Field:
-        """The force density over E, (H, W), on the rest frame's pixels, of the last frame."""
-        (lattice, step), view = self._lattice(load), self._views[self._offsets[-1]]
+        """The force density over E, (H, W), on the rest frame's pixels."""
+        (lattice, step), view = self._lattice(load), self._view
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, step)
 
     def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
-        """The force density over E at the nodes of a square lattice about the middle one, and their
+        """The force density over E at the nodes of a square lattice about the tissue's centre, and their
         distance [mm]."""
-        grid, (column, row) = compliance.lattice(), number_nodes().T
+        grid = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0]).lattice
+        step = np.diff(np.unique(grid.nodes[:, 0].round(6))).min()
+        column, row = np.rint(grid.nodes / step).astype(int).T
         half = max(column.max(), row.max())
         lattice = np.zeros((2 * half + 1,) * 2)
         lattice[row + half, column + half] = np.linalg.norm(load, axis=1) / grid.node_area
-        return lattice, compliance.NODE_MM
+        return lattice, float(step)
 
 
-def number_nodes() -> Ints:
-    """Column and row (K, 2) of the nodes that bear loads, from the middle one."""
-    return np.rint(compliance.lattice().nodes / compliance.NODE_MM).astype(int)
+def find_strongest(moved: Field, mask: Field) -> tuple[float, float]:
+    """The largest mean over 2 mm of the motion (C, N, N) mm on `GRID`, and its distance from the middle [mm].
 
-
-def join_loads(loads: Map, offsets: Sequence[Offset]) -> Map:
-    """Loads (T, K, 3) at the nodes about each frame's offset as (T, 3 N) at nodes that all frames share."""
-    nodes = number_nodes()
-    places = (nodes[None] + np.array(offsets)[:, None]).reshape(-1, 2)
-    shared, index = np.unique(places, axis=0, return_inverse=True)
-    joined = np.zeros((len(loads), len(shared), 3), np.float32)
-    joined[np.repeat(np.arange(len(loads)), len(nodes)), index.ravel()] = loads.reshape(-1, 3)
-    return joined.reshape(len(loads), -1)
+    `mask`: (N, N) above 0.5 where there is tissue.
+    """
+    inside = np.asarray(mask > 0.5, np.float64)
+    weight = gaussian_filter(inside, _NEAR_MM / GRID.pitch_mm)
+    size = gaussian_filter(inside * np.linalg.norm(moved, axis=0), _NEAR_MM / GRID.pitch_mm)
+    mean = np.where(inside > 0, size / np.maximum(weight, 1e-6), 0.0)
+    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
+    middle = (GRID.size - 1) / 2
+    return float(mean[row, column]), float(np.hypot(row - middle, column - middle)) * GRID.pitch_mm
 
 
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
@@ -359,11 +347,6 @@ def turning_factor(share: Floats | float) -> Floats:
     return np.asarray(1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6))
 
 
-def is_edge_seen(scene: MethodContext) -> bool:
-    """Whether the tissue's outline is its own, not the picture's border."""
-    return measure_border_share(scene.tissue) <= TISSUES.cut
-
-
 def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     """The tissues that agree with meta.yaml, each with the most likely Poisson's ratio in its range."""
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
@@ -376,7 +359,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
         stiffnesses = sorted({float(f"{stiffness:.2g}") for stiffness in between})
     membranes = {"stripped": [bare], "intact": stiffnesses, "unknown": [bare, *stiffnesses]}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
-    if "free" not in edges and not is_edge_seen(scene):
+    if "free" not in edges and measure_border_share(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
         TissueKind(edge, membrane, middle, stretch)
@@ -507,7 +490,8 @@ def find_gains(
 ) -> Gains:
     """Gains of frames with large motion, of rising slope, on the middle tissue; few of them are solved."""
     tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
-    opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen(scene) else None
+    is_edge_seen = measure_border_share(scene.tissue) <= TISSUES.cut
+    opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
     for frame, motion in large[::-2][: TISSUES.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -15,28 +13,16 @@ Point = tuple[float, float]  # (x, y) px
 
 # Chosen by hand.
 _CUT_OFF = 0.005  # share of the tissue that may lie beyond a grid that covers it
-_STILL_PX = 0.5  # 98th percentile of motion under which the grid isn't moved, where none is given
+_STILL_PX = 0.5  # 98th percentile of motion under which the grid isn't moved
 _COARSE = 8  # reduction of the map on which the motion's centre is searched
-
-
-@dataclass(frozen=True)
-class PlacementRule:
-    """Where a grid lies; lengths as shares of its width, chosen by hand."""
-
-    near: float = 0.25  # deviation of the mean over motion, whose maximum is its centre
-    off_centre: float = 0.25  # the grid is moved to motion further from its centre
-    still_px: float | None = None  # least mean of motion there for which it is moved
-    reach: float = 1.0  # largest distance of motion from its centre, for which it reaches beyond the tissue
+_OFF_CENTRE = 0.25  # share of the grid's width; the grid is moved to motion further from its centre
 
 
 class GridPlacement:
     """The grid's position, frame by frame; it is moved only if motion is far from its centre."""
 
-    def __init__(
-        self, tissue: Mask, scale_mm_per_px: float, grid: Grid, rule: PlacementRule = PlacementRule()
-    ) -> None:
+    def __init__(self, tissue: Mask, scale_mm_per_px: float, grid: Grid) -> None:
         """`tissue`: (H, W). UserError if it is empty, or if the scale is invalid."""
-        self._rule = rule
         self.centre_px = centre(tissue)  # current centre of the grid
         self.moves = 0  # number of times the grid was moved
         rows, columns = np.nonzero(tissue)
@@ -53,35 +39,27 @@ class GridPlacement:
             return self.centre_px
         usable = self._tissue if confidence is None else self._tissue & (confidence >= LOW_CONFIDENCE)
         power = np.square(flow.astype(np.float32)).sum(-1) * usable
-        point, strongest = self._find_strongest(power)
-        least = self._rule.still_px
-        if least is None:
-            strongest, least = float(np.quantile(power[self._tissue][::7], 0.98)), _STILL_PX
-        if strongest < least**2:
+        if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
             return self.centre_px
-        place = self._within(point)
-        distance = max(abs(a - b) for a, b in zip(place, self.centre_px, strict=True))
-        if distance > self._rule.off_centre * 2 * self._half:
+        place = self._within(self._find_strongest(power))
+        if max(abs(a - b) for a, b in zip(place, self.centre_px, strict=True)) > _OFF_CENTRE * 2 * self._half:
             self.centre_px, self.moves = place, self.moves + 1
         return self.centre_px
 
-    def _find_strongest(self, power: Map) -> tuple[Point, float]:
-        """The centre of the strongest motion (of two places the stronger), and its mean square [px^2]."""
+    def _find_strongest(self, power: Map) -> Point:
+        """The centre of the strongest motion; of two places the stronger, not their mean."""
         height, width = power.shape
         size = (max(1, width // _COARSE), max(1, height // _COARSE))
         coarse = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
         step = width / size[0], height / size[1]
-        deviation = max(2 * self._rule.near * self._half / step[0], 0.5)
-        smoothed = cv2.GaussianBlur(coarse, (0, 0), deviation, borderType=0)
+        smoothed = cv2.GaussianBlur(coarse, (0, 0), max(0.5 * self._half / step[0], 0.5), borderType=0)
         row, column = np.unravel_index(int(smoothed.argmax()), smoothed.shape)
-        point = (float(column) + 0.5) * step[0] - 0.5, (float(row) + 0.5) * step[1] - 0.5
-        return point, float(smoothed[row, column])
+        return (float(column) + 0.5) * step[0] - 0.5, (float(row) + 0.5) * step[1] - 0.5
 
     def _within(self, point: Point) -> Point:
-        """The nearest centre whose grid reaches as little as possible beyond the tissue, and to the point."""
-        position, reach = [], 2 * self._rule.reach * self._half
+        """The nearest centre whose grid reaches as little as possible beyond the tissue."""
+        position = []
         for value, (low, high) in zip(point, self._ends, strict=True):
             low, high = low + self._half, high - self._half
-            inside = min(max(value, low), high) if low < high else (low + high) / 2
-            position.append(min(max(inside, value - reach), value + reach))
+            position.append(min(max(value, low), high) if low < high else (low + high) / 2)
         return position[0], position[1]
