@@ -36,8 +36,8 @@ from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
-_NEAR_MM = 2.0  # deviation of means over the motion whose largest is called the strongest
-MOVING_MM = 0.05  # strongest motion that is none
+_NEAR_MM = 2.0  # deviation of the mean over motion that decides where it is strongest
+_MOVING_MM = 0.1  # largest such mean that is taken for none
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,8 @@ class Physics:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         is_wide = {tissue.edge for tissue in candidate_tissues(scene)} == {"free"}
-        self._strongest = (
-            (0.0, 0.0) if is_wide else None
-        )  # largest mean motion, and its distance from the middle
+        # The largest motion and its distance from the middle [mm], where tissue is wider than loads reach.
+        self._strongest = (0.0, 0.0) if is_wide else None
         self._frames: list[Observation] = []
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, no_motion = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
@@ -246,7 +245,7 @@ class Physics:
         if self._scene is None:
             return []
         size_mm, far_mm = self._strongest or (0.0, 0.0)
-        least_mm = TISSUES.living_mm if self._scene.living else MOVING_MM
+        least_mm = TISSUES.living_mm if self._scene.living else _MOVING_MM
         if size_mm > least_mm and far_mm > posterior.MODEL.reach_mm:
             fault = f"tissue moves most {far_mm:.0f} mm from its middle, where loads aren't sought"
             cure = "their force may be three times as large: draw tissue.png around the contact"
@@ -317,10 +316,10 @@ def find_strongest(moved: Field, mask: Field) -> tuple[float, float]:
 
     `mask`: (N, N) above 0.5 where there is tissue.
     """
-    inside = np.asarray(mask > 0.5, np.float64)
-    weight = gaussian_filter(inside, _NEAR_MM / GRID.pitch_mm)
-    size = gaussian_filter(inside * np.linalg.norm(moved, axis=0), _NEAR_MM / GRID.pitch_mm)
-    mean = np.where(inside > 0, size / np.maximum(weight, 1e-6), 0.0)
+    inside, sigma = np.asarray(mask > 0.5, np.float64), _NEAR_MM / GRID.pitch_mm
+    weight = np.maximum(gaussian_filter(inside, sigma), 1e-6)
+    means = [gaussian_filter(inside * part, sigma) / weight for part in moved]
+    mean = np.where(inside > 0, np.linalg.norm(means, axis=0), 0.0)
     row, column = np.unravel_index(int(mean.argmax()), mean.shape)
     middle = (GRID.size - 1) / 2
     return float(mean[row, column]), float(np.hypot(row - middle, column - middle)) * GRID.pitch_mm
