@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, softmax
 
 from bench.methods import compliance, large_motion, posterior, relaxation
@@ -36,8 +36,7 @@ from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
-_NEAR_MM = 2.0  # deviation of the mean over motion that decides where it is strongest
-_MOVING_MM = 0.1  # largest such mean that is taken for none
+_MOVING_MM = 0.1  # largest motion of the surface that is taken for none
 
 
 @dataclass(frozen=True)
@@ -129,12 +128,13 @@ class Physics:
     def _begin(self, scene: MethodContext, components: int) -> None:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
-        is_wide = {tissue.edge for tissue in candidate_tissues(scene)} == {"free"}
+        tissues = candidate_tissues(scene)
+        is_wide = {tissue.edge for tissue in tissues} == {"free"}
         # The largest motion and its distance from the middle [mm], where tissue is wider than loads reach.
         self._strongest = (0.0, 0.0) if is_wide else None
         self._frames: list[Observation] = []
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
-        first, no_motion = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
+        first, no_motion = tissues[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
         self._large, self._gains = list[tuple[Observation, SeenMotion]](), NO_GAIN
         self._weights = TissueWeights(first, np.ones(1), no_motion, False)
@@ -157,7 +157,7 @@ class Physics:
         if frame.trusted:
             surface = large_motion.measure_motion(moved, spread, self._view.mask, GRID)
             if self._strongest is not None:
-                self._strongest = max(self._strongest, find_strongest(moved, self._view.mask))
+                self._strongest = max(self._strongest, surface.find_strongest())
             least_slope = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, least_slope):
                 self._large.append((observation, surface))
@@ -309,20 +309,6 @@ class Physics:
         lattice = np.zeros((2 * half + 1,) * 2)
         lattice[row + half, column + half] = np.linalg.norm(load, axis=1) / grid.node_area
         return lattice, float(step)
-
-
-def find_strongest(moved: Field, mask: Field) -> tuple[float, float]:
-    """The largest mean over 2 mm of the motion (C, N, N) mm on `GRID`, and its distance from the middle [mm].
-
-    `mask`: (N, N) above 0.5 where there is tissue.
-    """
-    inside, sigma = np.asarray(mask > 0.5, np.float64), _NEAR_MM / GRID.pitch_mm
-    weight = np.maximum(gaussian_filter(inside, sigma), 1e-6)
-    means = [gaussian_filter(inside * part, sigma) / weight for part in moved]
-    mean = np.where(inside > 0, np.linalg.norm(means, axis=0), 0.0)
-    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
-    middle = (GRID.size - 1) / 2
-    return float(mean[row, column]), float(np.hypot(row - middle, column - middle)) * GRID.pitch_mm
 
 
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
