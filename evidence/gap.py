@@ -544,5 +544,15 @@ STUDY = Study(
     "gap/results.json",
     page,
     ("{mission} {mission-ood} {gap-clinical} --recordings {work}/foreign --work {work}/gap-study",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
+    needs=(
+        "mesh",
+        "mechanics",
+        "picture",
+        "truth",
+        "flow",
+        "stereo",
+        "network",
+        "score-stereo",
+        "wide-tissue",
+    ),
 )

@@ -37,10 +37,10 @@ DOME_MM = 70.0  # radius of curvature of the surface, likewise
 _OPEN_MM = 40.0  # radius of an opening without skull near
 # By hand; docs/results/fem/pareto has what elements cost and err.
 _POINT_MM = 1.0  # spacing of the points, which reach to the opening's edge
-_NODE_MM = 1.2  # spacing of the nodes, which stay as far inside it
+NODE_MM = 1.2  # spacing of the nodes that bear loads, which stay as far inside it
 _TETS = 3000  # of the map's own mesh, second order
 
-SETTINGS = _POINT_MM, _NODE_MM, _TETS
+SETTINGS = _POINT_MM, NODE_MM, _TETS
 """Settings of every compliance, for the key of what is kept on disk."""
 
 Edge = Literal["bonded", "slipping", "free"]
@@ -94,7 +94,7 @@ def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
 @lru_cache(maxsize=1)
 def lattice() -> Lattice:
     """Points and nodes of every compliance."""
-    points, nodes = _disc(_POINT_MM, OPENING_MM), _disc(_NODE_MM, OPENING_MM - _NODE_MM)
+    points, nodes = _disc(_POINT_MM, OPENING_MM), _disc(NODE_MM, OPENING_MM - NODE_MM)
     flat = np.column_stack([nodes, np.zeros(len(nodes))])
     return Lattice(points, nodes, surface_embedding.vertex_area(flat, Delaunay(nodes).simplices))
 

@@ -60,12 +60,6 @@ class SeenMotion:
     area_mm2: float  # of a point
     slope: float  # largest slope, mm per mm
 
-    def find_strongest(self) -> tuple[float, float]:
-        """The largest motion, and its distance from the middle of the tissue [mm]."""
-        size = np.linalg.norm(self.moved, axis=1)
-        place = int(size.argmax())
-        return float(size[place]), float(np.linalg.norm(self.points[place]))
-
 
 def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion:
     """Motion on a grid, by means over neighbours that are weighted by its precision.

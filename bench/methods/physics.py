@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, softmax
 
-from bench.methods import compliance, large_motion, posterior, relaxation
+from bench.methods import compliance, large_motion, load_window, posterior, relaxation
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.large_motion import SeenMotion
@@ -30,13 +30,16 @@ from bench.methods.method_interface import (
 from bench.methods.posterior import LoadBasis, Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
-from synth.arrays import Floats, Map, Mask
+from synth.arrays import Floats, Ints, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
 _MOVING_MM = 0.1  # largest motion of the surface that is taken for none
+
+Offset = tuple[int, int]
+"""Of the middle of a frame's loads from the tissue's, in nodes along x and y."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,16 @@ class Physics:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         tissues = candidate_tissues(scene)
-        is_wide = {tissue.edge for tissue in tissues} == {"free"}
-        # The largest motion and its distance from the middle [mm], where tissue is wider than loads reach.
-        self._strongest = (0.0, 0.0) if is_wide else None
+        self._is_edge_seen = is_edge_seen(scene)
+        # On tissue wider than an opening a contact may be farther from the middle than loads are sought.
+        self._wide_view: GridView | None = None
+        if {tissue.edge for tissue in tissues} == {"free"}:
+            grid = load_window.cover_tissue(scene.tissue, self._view.centre_px, scene.scale_mm_per_px)
+            self._wide_view = GridView(scene.tissue, scene.scale_mm_per_px, grid)
+        self._middle: load_window.Place = (0.0, 0.0)
+        self._missed_mm = 0.0  # largest distance of a moving place from the window's middle that isn't in it
+        self._views: dict[Offset, GridView] = {(0, 0): self._view}
+        self._offsets: list[Offset] = []
         self._frames: list[Observation] = []
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, no_motion = tissues[:1], np.zeros((components, 6, 0))
@@ -149,15 +159,22 @@ class Physics:
             moved, spread = frame.motion.motion, frame.motion.deviation
         if self._scene is not scene:
             self._begin(scene, moved.shape[2])
-        moved, spread = (self._view.mean(field.transpose(2, 0, 1)) for field in (moved, spread))
-        observation = observe(moved, spread, self._view.mask)
+        fields = moved.transpose(2, 0, 1), spread.transpose(2, 0, 1)
+        if frame.trusted and self._wide_view is not None:
+            self._place_window(self._wide_view, *fields)
+        offset = self._find_offset()
+        view = self._views[offset]
+        moved, spread = (view.mean(field) for field in fields)
+        observation = observe(moved, spread, view.mask)
         self._frames.append(observation)
+        self._offsets.append(offset)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
         if frame.trusted:
-            surface = large_motion.measure_motion(moved, spread, self._view.mask, GRID)
-            if self._strongest is not None:
-                self._strongest = max(self._strongest, surface.find_strongest())
+            if self._is_edge_seen and view is not self._view:  # an opening is about the tissue's middle
+                view = self._view
+                moved, spread = (view.mean(field) for field in fields)
+            surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
             least_slope = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, least_slope):
                 self._large.append((observation, surface))
@@ -167,6 +184,26 @@ class Physics:
             self._weighed_mm = observation.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
         return self._conclude(*self._infer(observation), picture=picture)
+
+    def _place_window(self, view: GridView, moved: Field, spread: Field) -> None:
+        """Moves the window in which loads are sought to the places that move."""
+        assert self._scene is not None
+        least_mm = TISSUES.living_mm if self._scene.living else _MOVING_MM
+        on_grid = view.mean(moved), view.mean(spread), view.mask
+        places = load_window.find_places(*on_grid, view.grid, least_mm)
+        self._middle, missed = load_window.place_window(places, self._middle)
+        distances = [float(np.hypot(x - self._middle[0], y - self._middle[1])) for x, y in missed]
+        self._missed_mm = max(self._missed_mm, *distances, 0.0)
+
+    def _find_offset(self) -> Offset:
+        """The window's middle in whole nodes, with its view."""
+        view, step = self._view, compliance.NODE_MM
+        x, y = (round(value / step) for value in self._middle)
+        if (x, y) not in self._views:
+            step_px = step / view.scale_mm_per_px
+            centre_px = view.centre_px[0] + x * step_px, view.centre_px[1] + y * step_px
+            self._views[x, y] = GridView(view.tissue, view.scale_mm_per_px, GRID, centre_px)
+        return x, y
 
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
@@ -197,8 +234,8 @@ class Physics:
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
         loads = np.stack([answer.load.astype(np.float32) for answer, *_ in posteriors])
-        flat, trusted = loads.reshape(len(loads), -1), np.array(self._trusted)
-        self.share_left = relaxation.measure_share_left(flat, times, trusted, self._scene.relaxation)
+        joined, trusted = join_loads(loads, self._offsets), np.array(self._trusted)
+        self.share_left = relaxation.measure_share_left(joined, times, trusted, self._scene.relaxation)
         self._loads = list(loads * self.share_left.astype(np.float32)[:, None, None])
         relaxed = [
             estimate.scale_by(share) for estimate, share in zip(estimates, self.share_left, strict=True)
@@ -213,11 +250,12 @@ class Physics:
     def map_forces(self) -> Map:
         """(T, N, N) magnitude of the force density in `GRID`'s cells [kPa], of the last `revise`."""
         assert self._scene is not None
-        young, middle = self._scene.young_kpa or UNKNOWN_YOUNG_KPA, ((GRID.size - 1) / 2,) * 2
+        young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
         maps = []
-        for load in self._loads:
+        for load, offset in zip(self._loads, self._offsets, strict=True):
             lattice, step = self._lattice(load)
-            maps.append(to_image(young * lattice, (GRID.size,) * 2, middle, GRID.pitch_mm, step))
+            x, y = ((GRID.size - 1) / 2 + number * step / GRID.pitch_mm for number in offset)
+            maps.append(to_image(young * lattice, (GRID.size,) * 2, (x, y), GRID.pitch_mm, step))
         return np.stack(maps)
 
     @property
@@ -244,12 +282,9 @@ class Physics:
         """What its result must not be taken for."""
         if self._scene is None:
             return []
-        size_mm, far_mm = self._strongest or (0.0, 0.0)
-        least_mm = TISSUES.living_mm if self._scene.living else _MOVING_MM
-        if size_mm > least_mm and far_mm > posterior.MODEL.reach_mm:
-            fault = f"tissue moves most {far_mm:.0f} mm from its middle, where loads aren't sought"
-            cure = "their force may be three times as large: draw tissue.png around the contact"
-            return [f"{fault}; {cure}", *self._large_warnings]
+        if self._missed_mm > 0:
+            fault = f"tissue moves at places {self._missed_mm:.0f} mm from where loads are sought, too"
+            return [f"{fault}: of their force a part may be missing", *self._large_warnings]
         return self._large_warnings
 
     @property
@@ -295,20 +330,33 @@ class Physics:
         return answer, low_gain, high_gain
 
     def _picture(self, load: Floats) -> Field:
-        """The force density over E, (H, W), on the rest frame's pixels."""
-        (lattice, step), view = self._lattice(load), self._view
+        """The force density over E, (H, W), on the rest frame's pixels, of the last frame."""
+        (lattice, step), view = self._lattice(load), self._views[self._offsets[-1]]
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, step)
 
     def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
-        """The force density over E at the nodes of a square lattice about the tissue's centre, and their
+        """The force density over E at the nodes of a square lattice about the middle one, and their
         distance [mm]."""
-        grid = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0]).lattice
-        step = np.diff(np.unique(grid.nodes[:, 0].round(6))).min()
-        column, row = np.rint(grid.nodes / step).astype(int).T
+        grid, (column, row) = compliance.lattice(), number_nodes().T
         half = max(column.max(), row.max())
         lattice = np.zeros((2 * half + 1,) * 2)
         lattice[row + half, column + half] = np.linalg.norm(load, axis=1) / grid.node_area
-        return lattice, float(step)
+        return lattice, compliance.NODE_MM
+
+
+def number_nodes() -> Ints:
+    """Column and row (K, 2) of the nodes that bear loads, from the middle one."""
+    return np.rint(compliance.lattice().nodes / compliance.NODE_MM).astype(int)
+
+
+def join_loads(loads: Map, offsets: Sequence[Offset]) -> Map:
+    """Loads (T, K, 3) at the nodes about each frame's offset as (T, 3 N) at nodes that all frames share."""
+    nodes = number_nodes()
+    places = (nodes[None] + np.array(offsets)[:, None]).reshape(-1, 2)
+    shared, index = np.unique(places, axis=0, return_inverse=True)
+    joined = np.zeros((len(loads), len(shared), 3), np.float32)
+    joined[np.repeat(np.arange(len(loads)), len(nodes)), index.ravel()] = loads.reshape(-1, 3)
+    return joined.reshape(len(loads), -1)
 
 
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
@@ -332,6 +380,11 @@ def turning_factor(share: Floats | float) -> Floats:
     return np.asarray(1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6))
 
 
+def is_edge_seen(scene: MethodContext) -> bool:
+    """Whether the tissue's outline is its own, not the picture's border."""
+    return measure_border_share(scene.tissue) <= TISSUES.cut
+
+
 def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     """The tissues that agree with meta.yaml, each with the most likely Poisson's ratio in its range."""
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
@@ -344,7 +397,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
         stiffnesses = sorted({float(f"{stiffness:.2g}") for stiffness in between})
     membranes = {"stripped": [bare], "intact": stiffnesses, "unknown": [bare, *stiffnesses]}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
-    if "free" not in edges and measure_border_share(scene.tissue) > TISSUES.cut:
+    if "free" not in edges and not is_edge_seen(scene):
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
         TissueKind(edge, membrane, middle, stretch)
@@ -475,8 +528,7 @@ def find_gains(
 ) -> Gains:
     """Gains of frames with large motion, of rising slope, on the middle tissue; few of them are solved."""
     tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
-    is_edge_seen = measure_border_share(scene.tissue) <= TISSUES.cut
-    opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen else None
+    opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen(scene) else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
     for frame, motion in large[::-2][: TISSUES.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))

@@ -1,1 +1,1 @@
-"""The guard: ten short probes of the product, and by how much each has moved since a result was stored."""
+"""The guard: eleven short probes of the product, and by how much each has moved since a result was stored."""

@@ -1,4 +1,4 @@
-"""Ten small runs of the product, each returning arrays whose change would move stored results.
+"""Eleven small runs of the product, each returning arrays whose change would move stored results.
 
 Flow, stereo and the scores read recordings that are stored beside this file, and the network reads fields of
 closed form, so that a change upstream doesn't move what follows it: a probe that moves names the stage.
@@ -24,6 +24,8 @@ import synth
 from bench.cli import app as bench_app
 from bench.methods import posterior
 from bench.methods.compliance import TissueKind
+from bench.methods.method_interface import FrameMotion, MethodContext
+from bench.methods.physics import Physics
 from learn.data.clips import Clip, read_clip
 from learn.data.grid import Grid
 from learn.settings import preset
@@ -34,6 +36,7 @@ from synth.fem import surface_embedding
 from synth.flow.segmentation import segment
 from synth.flow.stereo import stereo_track as stereo_track
 from synth.flow.stereo.calibration import read_rig
+from synth.flow.stereo.stereo_track import Motion3D
 from synth.sequence.fem_mechanics import build_volume
 
 Arrays = dict[str, Any]
@@ -238,6 +241,30 @@ def probe_score_stereo() -> Arrays:
     return _score("stereo", "--model", "stereo")
 
 
+def probe_wide_tissue() -> Arrays:
+    """Forces by physics, with two cameras and with one, of two dents in tissue wider than an opening."""
+    scale, rows, columns = 0.5, 80, 120  # mm per pixel
+    y, x = (np.mgrid[:rows, :columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2) * scale
+    size_mm = np.zeros((rows, columns))
+    for place, depth_mm in (((14.0, -5.0), 0.8), ((2.0, 3.0), 0.3)):
+        size_mm += depth_mm * np.exp(-(np.square(x - place[0]) + np.square(y - place[1])) / 18)
+    shape = np.stack([0.4 * size_mm, 0.2 * size_mm, size_mm], axis=-1).astype(np.float32)
+    arrays: Arrays = {}
+    with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
+        for cameras in (2, 1):
+            method = Physics()
+            scene = MethodContext(np.ones((rows, columns), bool), scale, 5.0, "stripped", (0.45, 0.45), False)
+            for second, level in enumerate((0, 0.5, 1)):
+                moved = np.float32(level) * shape
+                seen = Motion3D(moved, np.full_like(moved, 0.01)) if cameras == 2 else None
+                sure = np.ones((rows, columns), np.float32)
+                method(FrameMotion(moved[..., :2] / scale, sure, motion=seen, time_s=second), scene, False)
+            estimates = method.revise(np.zeros(3, bool))
+            arrays[f"force, cameras {cameras}"] = [estimate.force_mn for estimate in estimates]
+            arrays[f"map, cameras {cameras}"] = method.map_forces()
+    return arrays
+
+
 PROBES: Mapping[str, Probe] = {
     "mesh": Probe(probe_mesh, 1e-4, ("MESH",), ("synth/fem/mesh", "synth/geometry", "synth/render/anatomy")),
     "mechanics": Probe(probe_mechanics, 1e-4, ("CONTENT",), ("synth/fem", "synth/sequence", "synth/job")),
@@ -259,6 +286,7 @@ PROBES: Mapping[str, Probe] = {
         ("SCORING", "COMPLIANCE", "MOTION"),
         ("bench", "synth/flow/recording", "synth/video", "learn/inference"),
     ),
+    "wide-tissue": Probe(probe_wide_tissue, 3e-2, ("SCORING", "COMPLIANCE"), ("bench/methods",)),
 }
 """By name; the order is that of the pipeline."""
 

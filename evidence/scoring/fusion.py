@@ -210,5 +210,16 @@ STUDY = Study(
     "scoring/fusion/fusion.json",
     page,
     ("{mission-ood} --clinical {gap-clinical} --work {work}/fusion",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score", "score-stereo"),
+    needs=(
+        "mesh",
+        "mechanics",
+        "picture",
+        "truth",
+        "flow",
+        "stereo",
+        "network",
+        "score",
+        "score-stereo",
+        "wide-tissue",
+    ),
 )

@@ -153,3 +153,17 @@ def point_loads(
                 ]
             )
     return u
+
+
+def press_surface(points: Floats, force: Floats, poisson: float, radius_mm: float = 3.0) -> Floats:
+    """Motion (P, 3) mm of points (P, 2) mm of the surface under a force (3,) mN in x and z on a disc about
+    the origin, whose pressure falls to its rim; camera axes, E = 1 kPa."""
+    steps = np.linspace(-1, 1, 30)
+    disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    share = np.maximum(1 - np.square(disc).sum(axis=1), 0)
+    positions, share = radius_mm * disc[share > 0], share[share > 0] / share.sum()
+    world = np.column_stack([points * [1, -1], np.full(len(points), -0.05)])
+    along, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    moved = force[0] * point_loads(world, positions, share, along, poisson)
+    moved += force[2] * point_loads(world, positions, share, down, poisson)
+    return np.asarray(moved * [1, -1, -1], np.float64)

@@ -4,14 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from half_space import press_surface
 from numpy.typing import NDArray
 
 from bench.methods import force_mixture, physics, posterior
 from bench.methods.compliance import ElasticBlock, TissueKind
 from bench.methods.method_interface import FrameMotion, MethodContext
-from bench.methods.physics import Physics
 from bench.methods.posterior import LoadBasis, Observation
-from synth.flow.stereo.stereo_track import Motion3D
 
 Floats = NDArray[np.float64]
 BARE = TissueKind("bonded", 0.0, 0.45)
@@ -126,42 +125,12 @@ def test_intervals_have_90_percent_coverage_of_draws_from_the_model(basis: LoadB
 
 @pytest.mark.slow
 def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
-    """Boussinesq's and Cerruti's point forces on a disc (Johnson, Contact Mechanics, 1985, ch. 3)."""
-    nu, force, radius = 0.45, np.array([1.0, 0.0, 3.0]), 3.0
-    steps = np.linspace(-1, 1, 30) * radius
-    disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    disc = disc[np.hypot(*disc.T) < radius]
-    share = 1 - np.square(disc).sum(axis=1) / radius**2
-    share /= share.sum()
-    x, y = np.moveaxis(basis.lattice.points[:, None] - disc, -1, 0)
-    r = np.hypot(x, y).clip(0.05)
-    shear = 1 / (2 * (1 + nu))
-    p, q = force[2] / (4 * np.pi * shear), force[0] / (4 * np.pi * shear)
-    u = -p * (1 - 2 * nu) * x / r**2 + q * (2 * (1 - nu) / r + 2 * nu * x**2 / r**3)
-    v = -p * (1 - 2 * nu) * y / r**2 + q * 2 * nu * x * y / r**3
-    w = p * 2 * (1 - nu) / r + q * (1 - 2 * nu) * x / r**2
-    displacement = np.stack([(part * share).sum(axis=1) for part in (u, v, w)], axis=1)
+    nu, force = 0.45, np.array([1.0, 0.0, 3.0])
+    displacement = press_surface(basis.lattice.points, force, nu)
     free = posterior.load_basis(3, TissueKind("free", 0.0, nu))
     # The block's walls are fixed 50 mm away, where the half-space still sinks: allowed as own motion.
     estimate = posterior.infer(free, observe(displacement, 0.01), 0.05 * np.eye(18).reshape(3, 6, 18))
     assert estimate.force.mean == pytest.approx(force, abs=0.15 * 3.2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("place_mm", "is_warned"), [(0.0, False), (8.0, False), (14.0, True)])
-def test_motion_farther_from_the_middle_than_loads_reach_is_named(place_mm: float, is_warned: bool) -> None:
-    """On tissue of 60 x 40 mm; 14 mm from its middle a force is estimated at 0.6 of the true one."""
-    scale = 0.5
-    y, x = (np.mgrid[:80, :120] - np.array([39.5, 59.5])[:, None, None]) * scale
-    dent = np.exp(-np.square([x - place_mm, y]).sum(axis=0) / (2 * 3.0**2)).astype(np.float32)
-    method = Physics()
-    scene = MethodContext(np.ones((80, 120), bool), scale, 5.0, "stripped", living=False)
-    for level in (0.0, 1.0):
-        moved = np.float32(level) * np.stack([0 * dent, 0 * dent, 0.3 * dent], axis=-1)
-        motion = Motion3D(moved, np.full_like(moved, 0.01))
-        method(FrameMotion(moved[..., :2] / scale, np.ones_like(dent), motion=motion), scene, False)
-    method.revise(np.zeros(2, bool))
-    assert bool(method.warnings) == is_warned
 
 
 @pytest.mark.slow

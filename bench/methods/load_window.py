@@ -1,0 +1,96 @@
+"""Where loads are sought on tissue wider than the opening of `compliance`: about the places that move.
+
+An instrument shows as a place that moves more than the tissue around it. The window is moved only if such a
+place is far from its middle; of several it holds as many as fit, the strongest first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from learn.data.grid import Grid
+from synth.arrays import Floats, Map, Mask
+
+Place = tuple[float, float]
+"""Camera x, y from the middle of the tissue [mm]."""
+
+
+@dataclass(frozen=True)
+class WindowRule:
+    """Constants of the window, by hand."""
+
+    apart_mm: float = 6.0  # least distance of two places
+    weakest: float = 0.2  # least motion of a place over that of the strongest
+    smooth_mm: float = 1.5  # standard deviation of the means of motion
+    doubted: float = 2.0  # deviations of motion that are taken off its size
+    reach_mm: float = 9.0  # largest distance of the places in a window from its middle
+    off_mm: float = (
+        3.0  # least distance of their middle from its own, from which it is moved though it holds them
+    )
+    pitch_mm: float = 1.0  # of the grid on which they are sought
+    cells: int = 128  # of that grid, at most
+
+
+RULE = WindowRule()
+
+
+def cover_tissue(tissue: Mask, centre_px: Sequence[float], scale_mm_per_px: float) -> Grid:
+    """A grid about a tissue's centre that reaches to its farthest pixels. `tissue`: (H, W)."""
+    rows, columns = np.nonzero(tissue)
+    far_px = max(np.abs(columns - centre_px[0]).max(), np.abs(rows - centre_px[1]).max()) + 0.5
+    extent_mm = 2 * float(far_px) * scale_mm_per_px
+    return Grid(min(int(np.ceil(extent_mm / RULE.pitch_mm)), RULE.cells), extent_mm)
+
+
+def find_places(moved: Map, deviation: Map, mask: Map, grid: Grid, least_mm: float) -> list[Place]:
+    """The places that surely move more than what is around them, and by `least_mm` or more; the strongest
+    first.
+
+    `moved`, `deviation`: (C, N, N) mm on the grid; `mask`: (N, N) above 0.5 where there is tissue.
+    """
+    inside = (mask > 0.5).astype(np.float64)
+    doubt_mm = RULE.doubted * np.linalg.norm(deviation, axis=0)
+    sure_mm = np.sqrt(np.maximum(np.square(np.linalg.norm(moved, axis=0)) - np.square(doubt_mm), 0.0))
+    smooth = partial(gaussian_filter, sigma=RULE.smooth_mm / grid.pitch_mm, mode="constant")
+    size_mm = inside * smooth(inside * sure_mm) / np.maximum(smooth(inside), 1e-6)
+    around = 2 * round(RULE.apart_mm / grid.pitch_mm) + 1
+    is_place = size_mm == maximum_filter(size_mm, around, mode="constant")
+    is_place &= size_mm >= max(least_mm, RULE.weakest * float(size_mm.max()))
+    rows, columns = np.nonzero(is_place)
+    order = np.argsort(-size_mm[is_place], kind="stable")
+    places = (np.stack([columns, rows], axis=1)[order] - (grid.size - 1) / 2) * grid.pitch_mm
+    return [(float(x), float(y)) for x, y in places]
+
+
+def place_window(places: Sequence[Place], middle: Place) -> tuple[Place, list[Place]]:
+    """The window's middle for the places of a frame, and those that it does not reach.
+
+    `middle`: of the frame before.
+    """
+    held, missed = list[Place](), list[Place]()
+    for place in places:
+        (held if _enclose([*held, place])[1] <= RULE.reach_mm else missed).append(place)
+    if not held:
+        return middle, missed
+    best_middle = _enclose(held)[0]
+    far_mm = max(_measure_distance(place, middle) for place in held)
+    if far_mm > RULE.reach_mm or _measure_distance(best_middle, middle) > RULE.off_mm:
+        middle = best_middle
+    return middle, missed
+
+
+def _measure_distance(first: Place, second: Place) -> float:
+    return float(np.hypot(first[0] - second[0], first[1] - second[1]))
+
+
+def _enclose(places: Sequence[Place]) -> tuple[Place, float]:
+    """Middle and radius of the least circle around places."""
+    points: Floats = np.array(places)
+    (x, y), radius = cv2.minEnclosingCircle(points.astype(np.float32))
+    return (float(x), float(y)), float(radius)
