@@ -1,7 +1,7 @@
 """Where loads are sought on tissue wider than the opening of `compliance`: about the places that move.
 
-An instrument shows as a place that moves more than the tissue around it. The window is moved only if such a
-place is far from its middle; of several it holds as many as fit, the strongest first.
+An instrument shows as a place that moves more than the tissue around it. Of several such places the window
+holds as many as fit, the strongest first; where it holds them already it is not moved for little.
 """
 
 from __future__ import annotations
@@ -17,8 +17,16 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from learn.data.grid import Grid
 from synth.arrays import Floats, Map, Mask
 
-Place = tuple[float, float]
+Point = tuple[float, float]
 """Camera x, y from the middle of the tissue [mm]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place that moves more than the tissue around it."""
+
+    point: Point
+    motion_mm: float  # that is sure
 
 
 @dataclass(frozen=True)
@@ -30,11 +38,10 @@ class WindowRule:
     smooth_mm: float = 1.5  # standard deviation of the means of motion
     doubted: float = 2.0  # deviations of motion that are taken off its size
     reach_mm: float = 9.0  # largest distance of the places in a window from its middle
-    off_mm: float = (
-        3.0  # least distance of their middle from its own, from which it is moved though it holds them
-    )
+    off_mm: float = 3.0  # distance of their middle from its own, from which it is moved though it holds them
     pitch_mm: float = 1.0  # of the grid on which they are sought
     cells: int = 128  # of that grid, at most
+    named: float = 0.5  # motion of a place out of reach that is named, over the video's largest
 
 
 RULE = WindowRule()
@@ -64,33 +71,35 @@ def find_places(moved: Map, deviation: Map, mask: Map, grid: Grid, least_mm: flo
     is_place &= size_mm >= max(least_mm, RULE.weakest * float(size_mm.max()))
     rows, columns = np.nonzero(is_place)
     order = np.argsort(-size_mm[is_place], kind="stable")
-    places = (np.stack([columns, rows], axis=1)[order] - (grid.size - 1) / 2) * grid.pitch_mm
-    return [(float(x), float(y)) for x, y in places]
+    points = (np.stack([columns, rows], axis=1) - (grid.size - 1) / 2) * grid.pitch_mm
+    return [Place((float(points[k, 0]), float(points[k, 1])), float(size_mm[is_place][k])) for k in order]
 
 
-def place_window(places: Sequence[Place], middle: Place) -> tuple[Place, list[Place]]:
+def place_window(places: Sequence[Place], middle: Point) -> tuple[Point, list[Place]]:
     """The window's middle for the places of a frame, and those that it does not reach.
 
-    `middle`: of the frame before.
+    `places`: the strongest first; `middle`: of the frame before.
     """
-    held, missed = list[Place](), list[Place]()
+    held, missed = list[Point](), list[Place]()
     for place in places:
-        (held if _enclose([*held, place])[1] <= RULE.reach_mm else missed).append(place)
-    if not held:
-        return middle, missed
-    best_middle = _enclose(held)[0]
-    far_mm = max(_measure_distance(place, middle) for place in held)
-    if far_mm > RULE.reach_mm or _measure_distance(best_middle, middle) > RULE.off_mm:
-        middle = best_middle
+        if _enclose([*held, place.point])[1] <= RULE.reach_mm:
+            held.append(place.point)
+        else:
+            missed.append(place)
+    if held:
+        best_middle, far_mm = _enclose(held)[0], max(measure_distance(point, middle) for point in held)
+        if far_mm > RULE.reach_mm or measure_distance(best_middle, middle) > RULE.off_mm:
+            middle = best_middle
     return middle, missed
 
 
-def _measure_distance(first: Place, second: Place) -> float:
+def measure_distance(first: Point, second: Point) -> float:
+    """Distance of two points [mm]."""
     return float(np.hypot(first[0] - second[0], first[1] - second[1]))
 
 
-def _enclose(places: Sequence[Place]) -> tuple[Place, float]:
-    """Middle and radius of the least circle around places."""
-    points: Floats = np.array(places)
+def _enclose(given: Sequence[Point]) -> tuple[Point, float]:
+    """Middle and radius of the least circle around points."""
+    points: Floats = np.array(given)
     (x, y), radius = cv2.minEnclosingCircle(points.astype(np.float32))
     return (float(x), float(y)), float(radius)

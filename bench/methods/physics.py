@@ -138,8 +138,11 @@ class Physics:
         if {tissue.edge for tissue in tissues} == {"free"}:
             grid = load_window.cover_tissue(scene.tissue, self._view.centre_px, scene.scale_mm_per_px)
             self._wide_view = GridView(scene.tissue, scene.scale_mm_per_px, grid)
-        self._middle: load_window.Place = (0.0, 0.0)
-        self._missed_mm = 0.0  # largest distance of a moving place from the window's middle that isn't in it
+        self._middle: load_window.Point = (0.0, 0.0)
+        self._strongest_mm = 0.0  # largest motion of a place
+        self._missed = list[
+            tuple[float, float]
+        ]()  # places out of the window: motion, distance from its middle
         self._views: dict[Offset, GridView] = {(0, 0): self._view}
         self._offsets: list[Offset] = []
         self._frames: list[Observation] = []
@@ -192,8 +195,10 @@ class Physics:
         on_grid = view.mean(moved), view.mean(spread), view.mask
         places = load_window.find_places(*on_grid, view.grid, least_mm)
         self._middle, missed = load_window.place_window(places, self._middle)
-        distances = [float(np.hypot(x - self._middle[0], y - self._middle[1])) for x, y in missed]
-        self._missed_mm = max(self._missed_mm, *distances, 0.0)
+        self._strongest_mm = max(self._strongest_mm, *(place.motion_mm for place in places), 0.0)
+        self._missed += [
+            (place.motion_mm, load_window.measure_distance(place.point, self._middle)) for place in missed
+        ]
 
     def _find_offset(self) -> Offset:
         """The window's middle in whole nodes, with its view."""
@@ -282,9 +287,10 @@ class Physics:
         """What its result must not be taken for."""
         if self._scene is None:
             return []
-        if self._missed_mm > 0:
-            fault = f"tissue moves at places {self._missed_mm:.0f} mm from where loads are sought, too"
-            return [f"{fault}: of their force a part may be missing", *self._large_warnings]
+        least_mm = load_window.RULE.named * self._strongest_mm
+        if far_mm := [distance_mm for motion_mm, distance_mm in self._missed if motion_mm >= least_mm]:
+            fault = f"tissue moves {max(far_mm):.0f} mm from where loads are sought, too"
+            return [f"{fault}: a part of the force may be missing", *self._large_warnings]
         return self._large_warnings
 
     @property

@@ -63,19 +63,23 @@ def test_a_contact_that_is_not_in_the_window_is_named(place_mm: float, is_warned
     assert bool(method.warnings) == is_warned
 
 
+def make_places(*points: load_window.Point) -> list[load_window.Place]:
+    return [load_window.Place(point, 1.0) for point in points]
+
+
 def test_a_window_stays_while_it_holds_places_near_its_middle() -> None:
-    still: load_window.Place = (0.0, 0.0)
-    assert load_window.place_window([(2.0, 1.0)], still) == (still, [])
-    assert load_window.place_window([(8.0, 0.0), (-7.0, 0.0)], still) == (still, [])
+    still = (0.0, 0.0)
+    assert load_window.place_window(make_places((2.0, 1.0)), still) == (still, [])
+    assert load_window.place_window(make_places((8.0, 0.0), (-7.0, 0.0)), still) == (still, [])
     assert load_window.place_window([], (5.0, 3.0)) == ((5.0, 3.0), [])
 
 
 def test_a_window_is_moved_to_hold_the_strongest_places() -> None:
-    middle, missed = load_window.place_window([(12.0, 3.0), (-2.0, 3.0), (40.0, 3.0)], (0.0, 0.0))
+    middle, missed = load_window.place_window(make_places((12.0, 3.0), (-2.0, 3.0), (40.0, 3.0)), (0.0, 0.0))
     assert middle == pytest.approx((5.0, 3.0), abs=0.01)
-    assert missed == [(40.0, 3.0)]
-    middle, _ = load_window.place_window([(11.0, 0.0), (-6.5, 0.0)], (0.0, 0.0))  # one would be 11 mm away
-    assert middle == pytest.approx((2.25, 0.0), abs=0.01)
+    assert missed == make_places((40.0, 3.0))
+    middle, _ = load_window.place_window(make_places((11.0, 0.0), (-6.5, 0.0)), (0.0, 0.0))
+    assert middle == pytest.approx((2.25, 0.0), abs=0.01)  # one would be 11 mm away
 
 
 def test_places_are_where_tissue_moves_more_than_around() -> None:
@@ -90,8 +94,9 @@ def test_places_are_where_tissue_moves_more_than_around() -> None:
     sure = np.full_like(moved, 0.02)
     unsure = np.where((np.abs(x) < 12) & (np.abs(y - 5.5) < 12) & (x < 0), np.float32(0.5), sure)
 
-    def find(deviation: NDArray[np.float32], least_mm: float) -> list[load_window.Place]:
-        return load_window.find_places(moved, deviation, mask, grid, least_mm)
+    def find(deviation: NDArray[np.float32], least_mm: float) -> list[load_window.Point]:
+        places = load_window.find_places(moved, deviation, mask, grid, least_mm)
+        return [place.point for place in places]
 
     assert find(sure, 0.1) == [(10.5, 0.5), (-8.5, 5.5)]
     assert find(sure, 1.0) == [(10.5, 0.5)]
