@@ -1,14 +1,13 @@
 """Where loads are sought on tissue wider than the opening of `compliance`: about the places that move.
 
 An instrument shows as a place that moves more than the tissue around it. Of several such places the window
-holds as many as fit, the strongest first; where it holds them already it is not moved for little.
+holds as many as fit, the strongest first; it stays where it is while it holds them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -38,7 +37,6 @@ class WindowRule:
     smooth_mm: float = 1.5  # standard deviation of the means of motion
     doubted: float = 2.0  # deviations of motion that are taken off its size
     reach_mm: float = 9.0  # largest distance of the places in a window from its middle
-    off_mm: float = 3.0  # distance of their middle from its own, from which it is moved though it holds them
     pitch_mm: float = 1.0  # of the grid on which they are sought
     cells: int = 128  # of that grid, at most
     named: float = 0.5  # motion of a place out of reach that is named, over the video's largest
@@ -64,8 +62,8 @@ def find_places(moved: Map, deviation: Map, mask: Map, grid: Grid, least_mm: flo
     inside = (mask > 0.5).astype(np.float64)
     doubt_mm = RULE.doubted * np.linalg.norm(deviation, axis=0)
     sure_mm = np.sqrt(np.maximum(np.square(np.linalg.norm(moved, axis=0)) - np.square(doubt_mm), 0.0))
-    smooth = partial(gaussian_filter, sigma=RULE.smooth_mm / grid.pitch_mm, mode="constant")
-    size_mm = inside * smooth(inside * sure_mm) / np.maximum(smooth(inside), 1e-6)
+    # Less at the tissue's border, where motion is often wrong.
+    size_mm = inside * gaussian_filter(inside * sure_mm, RULE.smooth_mm / grid.pitch_mm, mode="constant")
     around = 2 * round(RULE.apart_mm / grid.pitch_mm) + 1
     is_place = size_mm == maximum_filter(size_mm, around, mode="constant")
     is_place &= size_mm >= max(least_mm, RULE.weakest * float(size_mm.max()))
@@ -86,10 +84,8 @@ def place_window(places: Sequence[Place], middle: Point) -> tuple[Point, list[Pl
             held.append(place.point)
         else:
             missed.append(place)
-    if held:
-        best_middle, far_mm = _enclose(held)[0], max(measure_distance(point, middle) for point in held)
-        if far_mm > RULE.reach_mm or measure_distance(best_middle, middle) > RULE.off_mm:
-            middle = best_middle
+    if any(measure_distance(point, middle) > RULE.reach_mm for point in held):
+        middle = _enclose(held)[0]
     return middle, missed
 
 

@@ -36,7 +36,9 @@ from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
-_MOVING_MM = 0.1  # largest motion of the surface that is taken for none
+_MOVING_MM = (
+    0.4  # least motion that moves a window, beyond the tissue's own: flow errs as much at instruments
+)
 
 Offset = tuple[int, int]
 """Of the middle of a frame's loads from the tissue's, in nodes along x and y."""
@@ -191,9 +193,9 @@ class Physics:
     def _place_window(self, view: GridView, moved: Field, spread: Field) -> None:
         """Moves the window in which loads are sought to the places that move."""
         assert self._scene is not None
-        least_mm = TISSUES.living_mm if self._scene.living else _MOVING_MM
+        own_mm = TISSUES.living_mm if self._scene.living else 0.0
         on_grid = view.mean(moved), view.mean(spread), view.mask
-        places = load_window.find_places(*on_grid, view.grid, least_mm)
+        places = load_window.find_places(*on_grid, view.grid, _MOVING_MM + own_mm)
         self._middle, missed = load_window.place_window(places, self._middle)
         self._strongest_mm = max(self._strongest_mm, *(place.motion_mm for place in places), 0.0)
         self._missed += [
