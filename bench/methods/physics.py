@@ -8,18 +8,17 @@ between them take the gain over the linear force that these show.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import map_coordinates
-from scipy.special import log_softmax, softmax
 
-from bench.methods import compliance, large_motion, load_window, posterior, relaxation
-from bench.methods.compliance import OPENING_MM, Edge, TissueKind
-from bench.methods.force_mixture import mix, size_interval
+from bench.methods import compliance, large_motion, posterior, relaxation
+from bench.methods.force_mixture import size_interval
 from bench.methods.large_motion import SeenMotion
+from bench.methods.load_window import LoadWindow, Offset, join_loads, number_nodes
 from bench.methods.method_interface import (
     Field,
     ForceEstimate,
@@ -27,46 +26,31 @@ from bench.methods.method_interface import (
     MethodContext,
     widen_small_forces,
 )
-from bench.methods.posterior import LoadBasis, Observation, Posterior
+from bench.methods.posterior import Observation, Posterior
+from bench.methods.tissue_weights import (
+    TissueWeights,
+    candidate_tissues,
+    describe,
+    infer,
+    is_edge_seen,
+    weigh_tissues,
+)
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
-from synth.arrays import Floats, Ints, Map, Mask
+from synth.arrays import Floats, Map, Mask
 from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
-from synth.flow.recording.find_tissue import measure_border_share
 
 GRID = Grid(48)
-_MOVING_MM = (
-    0.4  # least motion that moves a window, beyond the tissue's own: flow errs as much at instruments
-)
-
-Offset = tuple[int, int]
-"""Of the middle of a frame's loads from the tissue's, in nodes along x and y."""
 
 
 @dataclass(frozen=True)
-class TissueConstants:
-    """Candidate tissues and constants of their weights; by hand where no source is given."""
+class PhysicsConstants:
+    """Constants of a video's estimates; by hand where no source is given."""
 
-    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
-    stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
-    intact: float = 0.33  # prior probability of a membrane
-    stiff_mn_per_mm: float = 35.0
-    """Median of its stiffness: 0.05 to 0.2 mm of 100 to 1000 kPa (`MembraneSection`)."""
-    stiffer: float = 1.0  # deviation of that stiffness' logarithm
-    doubt: float = 2.0
-    """Largest difference of log evidence between stiffnesses, and between Poisson's ratios: strong loads
-    differ from the model's, and by their evidence a membrane is 3 to 20 times softer than it is."""
-    shown: int = 3  # stiffnesses in a posterior, the likeliest
-    poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
-    cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
-    wide: float = 1.2  # radius of the visible tissue, in openings, above which no skull edge is assumed
-    temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
-    strongest: int = 8  # frames that weight the tissues, every third
     growth: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
     living_mm: float = 0.4  # own motion of living tissue, half of 0.8 mm peak to peak (Faria 2014)
     quiet: float = 0.2  # least share of the frames, or of a breath, that shows the tissue's own motion
-    unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
     steeper: float = 1.2  # slope relative to the last, from which a frame may be solved by its own mechanics
     solved: int = 4  # frames so solved, at most
@@ -77,32 +61,7 @@ class TissueConstants:
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
 
 
-TISSUES = TissueConstants()
-
-
-@dataclass(frozen=True)
-class TissueWeights:
-    """The most likely tissues of a video, given its frames so far."""
-
-    tissues: tuple[TissueKind, ...]
-    weight: Floats  # of each tissue, with sum 1
-    own_mm: Floats  # (C, 6, M) modes of the tissue's own motion, see `own_motion`
-    assumed: bool  # whether that is a bound on what is not known, so that it may be 0
-
-    @property
-    def middle(self) -> TissueKind:
-        """The tissue to solve large motion on: the likeliest, with the geometric mean stiffness of those of
-        its edge and stretch, as the likeliest stiffness is hardly likelier than others."""
-        first = self.tissues[0]
-        if first.membrane == 0:
-            return first
-        indices = [
-            k
-            for k, tissue in enumerate(self.tissues)
-            if (tissue.edge, tissue.stretch) == (first.edge, first.stretch) and tissue.membrane > 0
-        ]
-        logs = np.log([self.tissues[k].membrane for k in indices])
-        return replace(first, membrane=float(f"{np.exp(np.average(logs, weights=self.weight[indices])):.3g}"))
+PHYSICS = PhysicsConstants()
 
 
 @dataclass(frozen=True)
@@ -134,20 +93,12 @@ class Physics:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         tissues = candidate_tissues(scene)
-        self._is_edge_seen = is_edge_seen(scene)
+        own_mm = PHYSICS.living_mm if scene.living else 0.0
         # On tissue wider than an opening a contact may be farther from the middle than loads are sought.
-        self._wide_view: GridView | None = None
-        if {tissue.edge for tissue in tissues} == {"free"}:
-            grid = load_window.cover_tissue(scene.tissue, self._view.centre_px, scene.scale_mm_per_px)
-            self._wide_view = GridView(scene.tissue, scene.scale_mm_per_px, grid)
-        self._middle: load_window.Point = (0.0, 0.0)
-        self._strongest_mm = 0.0  # largest motion of a place
-        self._missed = list[
-            tuple[float, float]
-        ]()  # places out of the window: motion, distance from its middle
-        self._views: dict[Offset, GridView] = {(0, 0): self._view}
-        self._offsets: list[Offset] = []
-        self._frames: list[Observation] = []
+        is_wide = {tissue.edge for tissue in tissues} == {"free"}
+        self._window = LoadWindow(self._view, own_mm if is_wide else None)
+        self._is_edge_seen = is_edge_seen(scene)
+        self._frames, self._offsets = list[Observation](), list[Offset]()
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, no_motion = tissues[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
@@ -165,14 +116,13 @@ class Physics:
         if self._scene is not scene:
             self._begin(scene, moved.shape[2])
         fields = moved.transpose(2, 0, 1), spread.transpose(2, 0, 1)
-        if frame.trusted and self._wide_view is not None:
-            self._place_window(self._wide_view, *fields)
-        offset = self._find_offset()
-        view = self._views[offset]
+        if frame.trusted:
+            self._window.follow(*fields)
+        self._offsets.append(self._window.offset)
+        view = self._window.view
         moved, spread = (view.mean(field) for field in fields)
         observation = observe(moved, spread, view.mask)
         self._frames.append(observation)
-        self._offsets.append(offset)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
         if frame.trusted:
@@ -180,37 +130,15 @@ class Physics:
                 view = self._view
                 moved, spread = (view.mean(field) for field in fields)
             surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
-            least_slope = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
+            least_slope = self._large[-1][1].slope * PHYSICS.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, least_slope):
                 self._large.append((observation, surface))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
-        if observation.signal_mm > max(TISSUES.growth * self._weighed_mm, posterior.MODEL.least_mm):
+        if observation.signal_mm > max(PHYSICS.growth * self._weighed_mm, posterior.MODEL.least_mm):
             self._weighed_mm = observation.signal_mm
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
         return self._conclude(*self._infer(observation), picture=picture)
-
-    def _place_window(self, view: GridView, moved: Field, spread: Field) -> None:
-        """Moves the window in which loads are sought to the places that move."""
-        assert self._scene is not None
-        own_mm = TISSUES.living_mm if self._scene.living else 0.0
-        on_grid = view.mean(moved), view.mean(spread), view.mask
-        places = load_window.find_places(*on_grid, view.grid, _MOVING_MM + own_mm)
-        self._middle, missed = load_window.place_window(places, self._middle)
-        self._strongest_mm = max(self._strongest_mm, *(place.motion_mm for place in places), 0.0)
-        self._missed += [
-            (place.motion_mm, load_window.measure_distance(place.point, self._middle)) for place in missed
-        ]
-
-    def _find_offset(self) -> Offset:
-        """The window's middle in whole nodes, with its view."""
-        view, step = self._view, compliance.NODE_MM
-        x, y = (round(value / step) for value in self._middle)
-        if (x, y) not in self._views:
-            step_px = step / view.scale_mm_per_px
-            centre_px = view.centre_px[0] + x * step_px, view.centre_px[1] + y * step_px
-            self._views[x, y] = GridView(view.tissue, view.scale_mm_per_px, GRID, centre_px)
-        return x, y
 
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
@@ -218,17 +146,17 @@ class Physics:
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
         times, tracked = np.array(self._times), np.flatnonzero(self._trusted)
         free_frames = [self._frames[k] for k in np.flatnonzero(contact_free) if self._frames[k].size_mm > 0]
-        breaths = TISSUES.breath_hz * float(np.diff(times)[contact_free[1:] & contact_free[:-1]].sum())
+        breaths = PHYSICS.breath_hz * float(np.diff(times)[contact_free[1:] & contact_free[:-1]].sum())
         if is_bounded := self._scene.living and len(tracked) > 0 and breaths < 0.5:
             frames = [self._frames[k] for k in tracked]
             quiet, factor = quietest_frames(times[tracked], frames)
             bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
-            if breaths > TISSUES.quiet:
+            if breaths > PHYSICS.quiet:
                 bounds.append(
                     turning_factor(breaths) * posterior.own_motion(basis, free_frames, correlated=False)
                 )
             least_bound = min(bounds, key=lambda bound: float(np.square(bound).sum()))
-            own_mm = least_bound.clip(-TISSUES.living_mm, TISSUES.living_mm)
+            own_mm = least_bound.clip(-PHYSICS.living_mm, PHYSICS.living_mm)
         else:
             own_mm = posterior.own_motion(basis, free_frames)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, is_bounded and bool(own_mm.any()))
@@ -289,11 +217,7 @@ class Physics:
         """What its result must not be taken for."""
         if self._scene is None:
             return []
-        least_mm = load_window.RULE.named * self._strongest_mm
-        if far_mm := [distance_mm for motion_mm, distance_mm in self._missed if motion_mm >= least_mm]:
-            fault = f"tissue moves {max(far_mm):.0f} mm from where loads are sought, too"
-            return [f"{fault}: a part of the force may be missing", *self._large_warnings]
-        return self._large_warnings
+        return [*self._window.warnings, *self._large_warnings]
 
     @property
     def _large_warnings(self) -> list[str]:
@@ -317,14 +241,14 @@ class Physics:
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
         factor, cameras = float(np.sqrt(low_gain * high_gain)), len(self._weights.own_mm) - 1
-        gain = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty))
+        gain = float(np.hypot(PHYSICS.gain, self._scene.young_uncertainty))
         low, high = size_interval(answer.force, gain, cameras)
         low, high = (
             (np.nan, np.nan) if self._is_beyond else (low * low_gain / factor, high * high_gain / factor)
         )
         density = np.float32(young) * self._picture(answer.load) if picture else None
         mixture = answer.force.scale_by(young).with_gain(
-            float(np.hypot(TISSUES.gain, 0.3 * np.log(high_gain / low_gain)))
+            float(np.hypot(PHYSICS.gain, 0.3 * np.log(high_gain / low_gain)))
         )
         size = young * answer.force.find_size(cameras)
         return ForceEstimate(young * answer.force.mean, density, young * low, young * high, mixture, size)
@@ -339,7 +263,7 @@ class Physics:
 
     def _picture(self, load: Floats) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels, of the last frame."""
-        (lattice, step), view = self._lattice(load), self._views[self._offsets[-1]]
+        (lattice, step), view = self._lattice(load), self._window.view
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, step)
 
     def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
@@ -352,21 +276,6 @@ class Physics:
         return lattice, compliance.NODE_MM
 
 
-def number_nodes() -> Ints:
-    """Column and row (K, 2) of the nodes that bear loads, from the middle one."""
-    return np.rint(compliance.lattice().nodes / compliance.NODE_MM).astype(int)
-
-
-def join_loads(loads: Map, offsets: Sequence[Offset]) -> Map:
-    """Loads (T, K, 3) at the nodes about each frame's offset as (T, 3 N) at nodes that all frames share."""
-    nodes = number_nodes()
-    places = (nodes[None] + np.array(offsets)[:, None]).reshape(-1, 2)
-    shared, index = np.unique(places, axis=0, return_inverse=True)
-    joined = np.zeros((len(loads), len(shared), 3), np.float32)
-    joined[np.repeat(np.arange(len(loads)), len(nodes)), index.ravel()] = loads.reshape(-1, 3)
-    return joined.reshape(len(loads), -1)
-
-
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
     """The frames in which the tissue moves least, and the factor from its motion there to that at any time.
 
@@ -375,10 +284,10 @@ def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list
     size = np.array([frame.signal_mm**2 for frame in frames])
     order = np.argsort(size, kind="stable")
     count = np.arange(1, len(frames) + 1)
-    share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
+    share = count / len(frames) * min(float(np.ptp(time_s)) * PHYSICS.breath_hz, 1.0)
     factor = turning_factor(share)
     bounds_mm = factor * np.sqrt(size[order] + posterior.MODEL.least_mm**2)
-    bounds_mm[share < TISSUES.quiet * share[-1]] = np.inf  # the least of many would be too little
+    bounds_mm[share < PHYSICS.quiet * share[-1]] = np.inf  # the least of many would be too little
     best = int(bounds_mm.argmin())
     return [int(k) for k in order[best // 2 : best + 1]], float(factor[best])
 
@@ -388,149 +297,6 @@ def turning_factor(share: Floats | float) -> Floats:
     return np.asarray(1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6))
 
 
-def is_edge_seen(scene: MethodContext) -> bool:
-    """Whether the tissue's outline is its own, not the picture's border."""
-    return measure_border_share(scene.tissue) <= TISSUES.cut
-
-
-def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
-    """The tissues that agree with meta.yaml, each with the most likely Poisson's ratio in its range."""
-    radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
-    low, high = scene.poisson
-    middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
-    bare, *stiffnesses = TISSUES.membranes_mm
-    if scene.membrane_mn_per_mm is not None:
-        ends = np.array(scene.membrane_mn_per_mm) / (scene.young_kpa or UNKNOWN_YOUNG_KPA)
-        between = np.geomspace(ends[0], ends[1], TISSUES.shown)
-        stiffnesses = sorted({float(f"{stiffness:.2g}") for stiffness in between})
-    membranes = {"stripped": [bare], "intact": stiffnesses, "unknown": [bare, *stiffnesses]}[scene.membrane]
-    edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
-    if "free" not in edges and not is_edge_seen(scene):
-        edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
-    return tuple(
-        TissueKind(edge, membrane, middle, stretch)
-        for edge in edges
-        for membrane in membranes
-        for stretch in (TISSUES.stretches if membrane else TISSUES.stretches[:1])
-    )
-
-
-def _prior(tissues: Sequence[TissueKind], scene: MethodContext) -> Floats:
-    """Logarithm of each tissue's prior probability: log-normal in the stiffness of a membrane that is stated
-    to be intact, unless its stiffness is too."""
-    stiffness = np.array([tissue.membrane for tissue in tissues])
-    is_usual = scene.membrane == "intact" and scene.membrane_mn_per_mm is None
-    is_covered, spread = stiffness > 0, TISSUES.stiffer if is_usual else np.inf
-    log_stiffness = np.log(np.where(is_covered, stiffness, 1.0) * (scene.young_kpa or UNKNOWN_YOUNG_KPA))
-    density = -0.5 * np.square((log_stiffness - np.log(TISSUES.stiff_mn_per_mm)) / spread)
-    share = {"intact": 1.0, "stripped": 0.0, "unknown": TISSUES.intact}[scene.membrane]
-    log_prior = np.full(len(tissues), -np.inf)
-    for part, weight in ((is_covered, share), (~is_covered, 1 - share)):
-        if part.any() and weight > 0:
-            log_prior[part] = np.log(weight) + log_softmax(density[part])
-    return log_prior
-
-
-def weigh_tissues(
-    scene: MethodContext, frames: Sequence[Observation], own_mm: Floats, assumed: bool = False
-) -> TissueWeights:
-    """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
-    strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
-    strongest = [frame for frame in strongest if frame.size_mm > 0]
-    evidences: dict[TissueKind, float] = {}  # evidence of those that are computed
-
-    def evidence(tissue: TissueKind, load: Callable[..., LoadBasis] = posterior.load_basis) -> float:
-        if tissue not in evidences:
-            basis = load(len(own_mm), tissue)
-            evidences[tissue] = TISSUES.temper * sum(
-                posterior.evidence(basis, frame, own_mm) for frame in strongest
-            )
-        return evidences[tissue]
-
-    candidates = candidate_tissues(scene)
-    logs = dict(zip(candidates, _prior(candidates, scene), strict=True))
-    score = dict[TissueKind, float]()
-    for part in (False, True):
-        if group := [tissue for tissue in candidates if (tissue.membrane > 0) is part]:
-            best = find_largest(group, lambda tissue: evidence(tissue) + logs[tissue])
-            # Where it isn't known whether there is a membrane, the best with and without one are compared by
-            # their evidence: spread over stiffnesses, it would count for bare tissue too.
-            variants = [tissue for tissue in group if replace(tissue, membrane=best.membrane) == best]
-            variants = variants if scene.membrane == "intact" else [best]
-            score |= _share(
-                variants, [evidence(tissue) for tissue in variants], [logs[tissue] for tissue in variants]
-            )
-    best = max(score, key=lambda tissue: score[tissue])
-    low, high = scene.poisson
-    others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != best.poisson]
-    score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
-    for nu in others:
-        tissue = replace(best, poisson=nu)
-        delta = evidence(tissue, posterior.load_basis_alone) - evidence(best)
-        # As evidence between stiffnesses: a ratio that fits must not bring its one stiffness alone.
-        delta = TISSUES.doubt * np.tanh(delta / TISSUES.doubt) if scene.membrane == "intact" else delta
-        score[tissue] = score[best] + delta
-    weight = np.maximum(softmax(list(score.values())), TISSUES.unlikely)
-    order = np.argsort(-weight, kind="stable")
-    tissues = list(score)
-    return TissueWeights(tuple(tissues[k] for k in order), weight[order] / weight.sum(), own_mm, assumed)
-
-
-def _share(
-    tissues: Sequence[TissueKind], evidence: Sequence[float], logs: Sequence[float]
-) -> dict[TissueKind, float]:
-    """Log weights of the likeliest of tissues that differ in stiffness alone, with differences of evidence of
-    at most `TISSUES.doubt`; `logs`: of their prior probabilities."""
-    behind = np.subtract(evidence, max(evidence))
-    weight = max(evidence) + TISSUES.doubt * np.expm1(behind / TISSUES.doubt) + np.array(logs)
-    return {tissues[k]: float(weight[k]) for k in np.argsort(-weight, kind="stable")[: TISSUES.shown]}
-
-
-def find_largest(candidates: Sequence[TissueKind], value: Callable[[TissueKind], float]) -> TissueKind:
-    """The candidate of the largest value, by a search uphill that looks at half of them.
-
-    Along the membrane's stiffness evidence has one maximum, which is another one for each edge.
-    """
-    stiffness = sorted({tissue.membrane for tissue in candidates})
-
-    def climb(tissue: TissueKind) -> TissueKind:
-        for step in (-1, 1):
-            index = stiffness.index(tissue.membrane) + step
-            while 0 <= index < len(stiffness):
-                neighbour = replace(tissue, membrane=stiffness[index])
-                if value(neighbour) <= value(tissue):
-                    break
-                tissue, index = neighbour, index + step
-        return tissue
-
-    middle = stiffness[len(stiffness) // 2]
-    previous, best = None, climb(next(tissue for tissue in candidates if tissue.membrane == middle))
-    while best != previous:
-        previous = best
-        edges = [tissue for tissue in candidates if replace(tissue, edge=best.edge) == best]
-        best = max((best, *map(climb, edges)), key=value)
-        stretches = [tissue for tissue in candidates if replace(tissue, stretch=best.stretch) == best]
-        best = climb(max((best, *stretches), key=value))
-    return best
-
-
-def infer(weights: TissueWeights, frame: Observation) -> Posterior:
-    """The posterior of a frame's loads, as a mixture over tissues."""
-    components, weight = len(weights.own_mm), weights.weight
-    worlds = [(tissue, weights.own_mm) for tissue in weights.tissues]
-    if weights.assumed:
-        worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
-        weight = np.append(weight, TISSUES.unlikely)
-    posteriors = [
-        posterior.infer(posterior.load_basis(components, tissue), frame, modes) for tissue, modes in worlds
-    ]
-    return Posterior(
-        float(weight @ [answer.evidence for answer in posteriors]),
-        mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
-        sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
-    )
-
-
 def find_gains(
     scene: MethodContext, weights: TissueWeights, large: Sequence[tuple[Observation, SeenMotion]]
 ) -> Gains:
@@ -538,11 +304,11 @@ def find_gains(
     tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen(scene) else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
-    for frame, motion in large[::-2][: TISSUES.solved]:
+    for frame, motion in large[::-2][: PHYSICS.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))
         if size == 0:
             continue
-        ends = TISSUES.unsolved
+        ends = PHYSICS.unsolved
         try:
             forces = [
                 large_motion.reaction(motion, tissue, opening_mm, alpha) for alpha in sorted(set(scene.alpha))
@@ -560,10 +326,10 @@ def find_monocular_gains(weights: TissueWeights, strongest: Observation, is_stee
     """Gains with one camera, to which depth is hidden: what they may be where the linear force is large, or
     motion across the view steep."""
     size = float(np.linalg.norm(infer(weights, strongest).force.mean))
-    if size <= TISSUES.linear and not is_steep:
+    if size <= PHYSICS.linear and not is_steep:
         return NO_GAIN
-    low, high = TISSUES.unsolved
-    linear = TISSUES.linear if size > TISSUES.linear else 0.5 * size
+    low, high = PHYSICS.unsolved
+    linear = PHYSICS.linear if size > PHYSICS.linear else 0.5 * size
     return Gains(np.array([0.0, linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
 
 
@@ -585,17 +351,3 @@ def observe(moved: Field, spread: Field, mask: Field) -> Observation:
         for parts in (moved, spread)
     ]
     return Observation(np.where(inside, values[0], 0.0), np.where(inside, values[1], np.inf))
-
-
-def describe(weights: TissueWeights, scene: MethodContext) -> str:
-    """The most likely tissue, in words."""
-    edge, nu = weights.tissues[0].edge, weights.tissues[0].poisson
-    rest = f"tissue edge {edge}, Poisson's ratio {nu:g}"
-    if scene.membrane != "unknown":
-        return f"membrane {scene.membrane}, as stated; {rest}"
-    unit = "mm times E" if scene.young_kpa is None else "mN/mm"
-    stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
-    likeliest = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
-    advice = ", a living brain's is intact unless it was opened" if scene.living else ""
-    verdict = f"motion does not reliably show whether there is a membrane (meta.yaml's `membrane`{advice})"
-    return f"{verdict}: intervals hold both, {likeliest}; {rest}"

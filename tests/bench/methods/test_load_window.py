@@ -113,10 +113,10 @@ def test_a_grid_covers_tissue_of_any_size() -> None:
 
 
 def test_loads_of_frames_with_different_middles_are_joined_where_they_lie() -> None:
-    nodes = physics.number_nodes()
+    nodes = load_window.number_nodes()
     loads, offsets = np.zeros((2, len(nodes), 3), np.float32), [(0, 0), (3, -2)]
     loads[0, np.flatnonzero((nodes == (4, 1)).all(axis=1))] = 2.0
     loads[1, np.flatnonzero((nodes == (1, 3)).all(axis=1))] = 5.0
-    joined = physics.join_loads(loads, offsets)
+    joined = load_window.join_loads(loads, offsets)
     assert joined.sum() == loads.sum()
     assert (joined[0] * joined[1]).sum() == pytest.approx(3 * 10.0)

@@ -7,10 +7,11 @@ import pytest
 from half_space import press_surface
 from numpy.typing import NDArray
 
-from bench.methods import force_mixture, physics, posterior
+from bench.methods import force_mixture, physics, posterior, tissue_weights
 from bench.methods.compliance import ElasticBlock, TissueKind
 from bench.methods.method_interface import FrameMotion, MethodContext
 from bench.methods.posterior import LoadBasis, Observation
+from bench.methods.tissue_weights import candidate_tissues, infer, weigh_tissues
 
 Floats = NDArray[np.float64]
 BARE = TissueKind("bonded", 0.0, 0.45)
@@ -140,15 +141,15 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
     stiff = []
     for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
         frames = [observe(press(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
-        weights = physics.weigh_tissues(scene, frames, STILL)
+        weights = weigh_tissues(scene, frames, STILL)
         stiff.append(weights.tissues[0].membrane)
     # On another mesh bare tissue may be taken for a thin membrane, never for a thick one.
     assert stiff[0] <= 5
     assert stiff[1] > 20
     stated_scene = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
-    assert {
-        (candidate.membrane, candidate.poisson) for candidate in physics.candidate_tissues(stated_scene)
-    } == {(0.0, 0.49)}
+    assert {(candidate.membrane, candidate.poisson) for candidate in candidate_tissues(stated_scene)} == {
+        (0.0, 0.49)
+    }
 
 
 @pytest.mark.slow
@@ -159,18 +160,22 @@ def test_a_stated_stiffness_of_the_membrane_gives_the_force(basis: LoadBasis) ->
     true, sizes = np.hypot(1.0, 4.0), []
     for stiff in ((80.0, 80.0), (10.0, 10.0)):
         scene = MethodContext(*context, membrane_mn_per_mm=stiff)
-        weights = physics.weigh_tissues(scene, frames, STILL)
+        weights = weigh_tissues(scene, frames, STILL)
         assert {tissue.membrane for tissue in weights.tissues} == {stiff[0] / young}
-        sizes.append(float(np.linalg.norm(physics.infer(weights, frames[1]).force.mean)))
+        sizes.append(float(np.linalg.norm(infer(weights, frames[1]).force.mean)))
     assert sizes[0] == pytest.approx(true, rel=0.15)
     assert sizes[1] < 0.9 * sizes[0], "a membrane that is stated too soft hides force"
     between = MethodContext(*context, membrane_mn_per_mm=(60.0, 100.0))
-    assert {candidate.membrane for candidate in physics.candidate_tissues(between)} == {30.0, 39.0, 50.0}
+    assert {candidate.membrane for candidate in candidate_tissues(between)} == {
+        30.0,
+        39.0,
+        50.0,
+    }
 
 
 def test_evidence_for_a_soft_membrane_is_not_taken_for_certain() -> None:
     tissues = [TissueKind("bonded", membrane, 0.45, 1.02) for membrane in (5.0, 15.0, 40.0, 100.0)]
-    shares = physics._share(tissues, [0.0, -20.0, -80.0, -400.0], [-1.0, -1.0, -1.0, -1.0])
+    shares = tissue_weights._share(tissues, [0.0, -20.0, -80.0, -400.0], [-1.0, -1.0, -1.0, -1.0])
     weight = np.exp(list(shares.values()))
     assert len(shares) == 3
     assert weight.max() == pytest.approx(np.exp(-1.0))

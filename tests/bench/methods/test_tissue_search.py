@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.methods.compliance import Edge, TissueKind
-from bench.methods.physics import TISSUES, TissueWeights, find_largest
+from bench.methods.tissue_weights import TISSUES, TissueWeights, find_largest
 
 EDGES: tuple[Edge, ...] = ("bonded", "slipping")
 
