@@ -147,9 +147,9 @@ written by `make docs` from `bench/checks/protocol.yaml`.
 | clocks | one clock, or taps | |
 | stiffness | measured next to the site | 0.5 kPa throughout |
 
-Scale, stiffness and a second camera decide most: force is proportional to stiffness and to the square of
-the scale, and one camera hardly measures force along its line of sight. What each further statement in
-`meta.yaml` gains, on 12 rendered recordings of 3 s: mean error in % of the peak force
+Scale, stiffness and a second camera decide most: force is proportional to stiffness (a membrane's is its
+own) and to the square of the scale, and one camera hardly measures force along its line of sight. What each
+further statement in `meta.yaml` gains, on 12 rendered recordings of 3 s: mean error in % of the peak force
 ([measured](../results/scoring/stability/README.md), at an earlier look):
 
 | stated, with all above | two cameras: bare tissue; membrane; pulse | one camera |

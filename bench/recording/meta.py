@@ -205,7 +205,7 @@ class Meta(Section):
 
     scale_mm_per_px: Positive | Literal["unknown"] | None = None
     """Millimetres per pixel at the tissue, or `unknown`: forces are then relative. Give this or
-    `calibration`."""
+    `calibration`; with `stereo` neither is needed, as two cameras measure it."""
     calibration: ScaleCalibration | None = None
     """A way to find the scale."""
     scale_uncertainty: Share | None = None
@@ -264,12 +264,16 @@ class Meta(Section):
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:
-        if (self.scale_mm_per_px is None) == (self.calibration is None):
+        if self.scale_mm_per_px is not None and self.calibration is not None:
             raise ValueError("give either scale_mm_per_px or calibration")
+        if (self.scale_mm_per_px, self.calibration, self.stereo) == (None, None, None):
+            raise ValueError(
+                "give scale_mm_per_px or calibration, or stereo, whose cameras measure the scale"
+            )
         if self.stereo is not None and self.depth is not None:
             raise ValueError("give stereo or depth, not both")
         if self.scale_mm_per_px == "unknown" and (self.stereo or self.depth) is not None:
-            raise ValueError("stereo and depth are in millimetres: give the scale")
+            raise ValueError("two cameras measure the scale, a depth camera needs it: not unknown")
         if self.sync.method == "correlate" and self.sync.calibration_s is None:
             raise ValueError("sync.method correlate needs sync.calibration_s")
         return self

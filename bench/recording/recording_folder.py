@@ -85,7 +85,7 @@ class Recording:
     @cached_property
     def scale(self) -> PixelScale:
         """Millimetres per pixel at the tissue, found once. UserError: as of `find_scale`."""
-        return find_scale(self.meta, self.folder, self.frames)
+        return find_scale(self.meta, self.folder, self.frames, self.right_frames)
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""

@@ -88,7 +88,7 @@ class AnatomySection(Section):
     """Where the skull is open."""
     attachments: tuple[AttachmentSection, ...] = ()
     """Regions inside in which the tissue is fixed, such as the falx: a list of {point, radius_mm, normal,
-    thickness_mm}, normal for a sheet. Empty: only the skull holds it."""
+    thickness_mm}, normal for a sheet. Empty: the skull holds it, and a block its walls and base."""
 
     @model_validator(mode="after")
     def _mesh_is_placed(self) -> AnatomySection:

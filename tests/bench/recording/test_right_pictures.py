@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 from skimage import data
 
@@ -107,6 +108,23 @@ def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> Non
         assert tracked.stereo.baseline_mm == pytest.approx(BASE, rel=1e-3)
         assert tracked.stereo.epipolar_px < 0.1
         assert (tracked.stereo.copied, tracked.stereo.frozen) == (False, 0)
+
+
+def test_two_cameras_measure_a_scale_that_is_not_stated(make: Make) -> None:
+    folder = make("right")
+    about = yaml.safe_load((folder / "meta.yaml").read_text("utf-8"))
+    del about["scale_mm_per_px"]
+    recording_writer.write_meta(folder, about)
+    scale = open_recording(folder).scale
+    assert scale.mm_per_px == pytest.approx(AWAY / FOCAL, rel=0.01)
+    assert scale.uncertainty < 0.05
+    recording_writer.write_meta(folder, about | {"rest_frame": 7})
+    with pytest.raises(UserError, match="frames 7"):
+        _ = open_recording(folder).scale
+    del about["stereo"]
+    recording_writer.write_meta(folder, about)
+    with pytest.raises(UserError, match="scale_mm_per_px"):
+        open_recording(folder)
 
 
 @pytest.mark.parametrize(("second", "lost"), [("right", "001.png"), ("depth", "001.npy")])

@@ -1,5 +1,6 @@
 """Sensor processing of known signals, and scales from drawn boards."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from bench.recording.meta import Meta, SensorMeta
 from bench.recording.recording_folder import Force
 from bench.sensor import force_sensor
 from synth.errors import UserError
+from synth.video.read_video import Picture
 
 
 def stack_axes(x: np.ndarray) -> np.ndarray:
@@ -86,6 +88,10 @@ def test_a_gap_does_not_change_the_sample_interval_and_frames_in_it_have_no_forc
     assert force_mn[[1, 3], 0] == pytest.approx([0.25, 2.25])
 
 
+def no_pictures() -> Iterator[Picture]:
+    return iter(())
+
+
 def test_checkerboard_scale(tmp_path: Path) -> None:
     square = 23.4
     y, x = np.mgrid[: 8 * 24 + 60, : 10 * 24 + 60]
@@ -96,7 +102,7 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
     def find(columns: int, rows: int) -> recording_scale.PixelScale:
         board = {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}
         return recording_scale.find_scale(
-            Meta.model_validate({"calibration": board}), tmp_path, lambda: iter(())
+            Meta.model_validate({"calibration": board}), tmp_path, no_pictures, no_pictures
         )
 
     scale = find(7, 5)
@@ -108,6 +114,6 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
 
 def test_scale_bar() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
-    scale = recording_scale.find_scale(about, Path(), lambda: iter(()))
+    scale = recording_scale.find_scale(about, Path(), no_pictures, no_pictures)
     assert scale.mm_per_px == pytest.approx(0.05)
     assert scale.uncertainty == pytest.approx(np.sqrt(2) / 100)
