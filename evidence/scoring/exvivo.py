@@ -264,5 +264,5 @@ STUDY = Study(
     measure,
     "exvivo/*/pool.json",
     steps=("{work}/exvivo --photo {photo}",),
-    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo", "wide-tissue"),
+    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
 )

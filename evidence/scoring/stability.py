@@ -236,5 +236,5 @@ STUDY = Study(
     "scoring/stability/stability.json",
     page,
     ("{work}/degraded",),
-    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo", "wide-tissue"),
+    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
 )
