@@ -55,7 +55,7 @@ _PER_MM = 10.0  # that deviation over that of the motion
 class SeenMotion:
     """Motion of the visible surface between rest and a frame, at points of a regular grid."""
 
-    points: Floats  # (P, 2) mm from the middle of the tissue, camera x and y
+    points: Floats  # (P, 2) mm from the middle of the grid, camera x and y
     moved: Floats  # (P, C) mm, camera axes
     area_mm2: float  # of a point
     slope: float  # largest slope, mm per mm

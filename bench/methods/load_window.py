@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from bench.methods import compliance
+from bench.methods import compliance, posterior
 from learn.data.grid import Grid, GridView
 from synth.arrays import Floats, Ints, Map, Mask
 
@@ -37,15 +37,18 @@ class WindowRule:
     """Constants of the window, by hand."""
 
     apart_mm: float = 6.0  # least distance of two places
-    weakest: float = 0.2  # least motion of a place over that of the strongest
+    weakest: float = 0.2  # least motion of a place over that of the frame's strongest
+    most: int = 8  # places of a frame
     smooth_mm: float = 1.5  # standard deviation of the means of motion
-    doubted: float = 2.0  # deviations of motion that are taken off its size
-    reach_mm: float = 9.0  # largest distance of the places in a window from its middle
+    doubt: float = 2.0  # deviations of motion that are taken off its size
+    reach_mm: float = 8.6  # largest distance of the places in a window from its middle, but for whole nodes
     pitch_mm: float = 1.0  # of the grid on which they are sought
     cells: int = 128  # of that grid, at most
     moving_mm: float = 0.4
-    """Least motion of a place, beyond the tissue's own: flow errs by as much at instruments."""
-    named: float = 0.5  # motion of a place out of reach that is named, over the video's largest
+    """Least motion of a place that moves a window, beyond the tissue's own: flow errs by as much at
+    instruments."""
+    seen_mm: float = 0.1  # least motion, likewise, of a place that is named if it isn't reached
+    named: float = 0.5  # its motion over that of the video's strongest place
 
 
 RULE = WindowRule()
@@ -54,52 +57,65 @@ RULE = WindowRule()
 class LoadWindow:
     """The window of a video, frame by frame."""
 
-    def __init__(self, view: GridView, own_mm: float | None) -> None:
-        """`view`: of the grid that physics observes, about the tissue's middle; `own_mm`: the tissue's own
-        motion; None: the window stays."""
+    def __init__(self, view: GridView, own_motion_mm: float, is_movable: bool) -> None:
+        """`view`: of the grid that physics observes, about the tissue's middle; `own_motion_mm`: of the
+        tissue, at most."""
         self.offset: Offset = (0, 0)
-        self._views, self._wide_view = {self.offset: view}, None
-        if own_mm is not None:
+        self._middle_view, self._view = view, view
+        self._own_mm = own_motion_mm
+        self.whole: GridView | None = None  # a grid that covers the tissue; None: the window stays
+        if is_movable:
             grid = cover_tissue(view.tissue, view.centre_px, view.scale_mm_per_px)
-            self._wide_view = GridView(view.tissue, view.scale_mm_per_px, grid)
-            self._least_mm = RULE.moving_mm + own_mm
-        self._middle: Point = (0.0, 0.0)
+            self.whole = GridView(view.tissue, view.scale_mm_per_px, grid)
         self._strongest_mm = 0.0  # largest motion of a place so far
-        self._missed = list[tuple[float, float]]()  # places not reached: motion, distance from the middle
+        self._beyond = list[Place]()  # places of the last frame that the window doesn't reach
+        self._missed = list[tuple[float, float]]()  # of such in two frames: motion, distance from the middle
 
     def follow(self, moved: Map, deviation: Map) -> None:
         """Moves the window to the places that move. `moved`, `deviation`: (C, H, W) mm."""
-        if (view := self._wide_view) is None:
+        if self.whole is None:
             return
+        view, node_mm = self.whole, compliance.NODE_MM
         on_grid = view.mean(moved), view.mean(deviation), view.mask
-        places = find_places(*on_grid, view.grid, self._least_mm)
-        self._middle, missed = place_window(places, self._middle)
-        x, y = (round(value / compliance.NODE_MM) for value in self._middle)
-        self.offset = x, y
+        places = find_places(*on_grid, view.grid, RULE.seen_mm + self._own_mm)
+        moving = [place.point for place in places if place.motion_mm >= RULE.moving_mm + self._own_mm]
+        middle = place_window(moving, self._find_middle())
+        self.offset = round(middle[0] / node_mm), round(middle[1] / node_mm)
         self._strongest_mm = max(self._strongest_mm, *(place.motion_mm for place in places), 0.0)
-        self._missed += [(place.motion_mm, measure_distance(place.point, self._middle)) for place in missed]
+        self._notice(places)
+
+    def _notice(self, places: Sequence[Place]) -> None:
+        """Remembers places that a window did not reach in two frames in turn: in one, flow may be wrong."""
+        middle, before = self._find_middle(), self._beyond
+        self._beyond = [p for p in places if measure_distance(p.point, middle) > posterior.MODEL.reach_mm]
+        for place in self._beyond:
+            if any(measure_distance(place.point, other.point) < RULE.apart_mm for other in before):
+                self._missed.append((place.motion_mm, measure_distance(place.point, middle)))
+
+    def _find_middle(self) -> Point:
+        return self.offset[0] * compliance.NODE_MM, self.offset[1] * compliance.NODE_MM
 
     @property
     def view(self) -> GridView:
-        """The grid that physics observes, about the window's middle in whole nodes."""
-        if self.offset not in self._views:
-            view = self._views[0, 0]
-            step_px = compliance.NODE_MM / view.scale_mm_per_px
-            x, y = (
-                start + number * step_px for start, number in zip(view.centre_px, self.offset, strict=True)
-            )
-            self._views[self.offset] = GridView(view.tissue, view.scale_mm_per_px, view.grid, (x, y))
-        return self._views[self.offset]
+        """The grid that physics observes, about the window's middle."""
+        scale, (x, y) = self._middle_view.scale_mm_per_px, self._middle_view.centre_px
+        right_mm, down_mm = self._find_middle()
+        centre_px = x + right_mm / scale, y + down_mm / scale
+        if self.offset == (0, 0):
+            self._view = self._middle_view
+        elif self._view.centre_px != centre_px:
+            self._view = GridView(self._middle_view.tissue, scale, self._middle_view.grid, centre_px)
+        return self._view
 
     @property
     def warnings(self) -> list[str]:
-        """Motion that no window held."""
+        """Motion that no window reached."""
         least_mm = RULE.named * self._strongest_mm
         distances_mm = [distance_mm for motion_mm, distance_mm in self._missed if motion_mm >= least_mm]
         if not distances_mm:
             return []
         fault = f"tissue moves {max(distances_mm):.0f} mm from where loads are sought, too"
-        return [f"{fault}: a part of the force may be missing"]
+        return [f"{fault}: a part of the force may be missing; draw tissue.png around one contact"]
 
 
 def cover_tissue(tissue: Mask, centre_px: Sequence[float], scale_mm_per_px: float) -> Grid:
@@ -111,39 +127,37 @@ def cover_tissue(tissue: Mask, centre_px: Sequence[float], scale_mm_per_px: floa
 
 
 def find_places(moved: Map, deviation: Map, mask: Map, grid: Grid, least_mm: float) -> list[Place]:
-    """The places that surely move more than what is around them, and by `least_mm` or more; the strongest
-    first.
+    """The places that surely move, and otherwise than most of the tissue, more than what is around them and
+    by `least_mm` or more; the strongest first.
 
     `moved`, `deviation`: (C, N, N) mm on the grid; `mask`: (N, N) above 0.5 where there is tissue.
     """
-    inside = (mask > 0.5).astype(np.float64)
-    doubt_mm = RULE.doubted * np.linalg.norm(deviation, axis=0)
-    sure_mm = np.sqrt(np.maximum(np.square(np.linalg.norm(moved, axis=0)) - np.square(doubt_mm), 0.0))
+    inside = mask > 0.5
+    common = np.median(moved[:, inside], axis=1)[:, None, None]
+    # Without the common motion still tissue would move, too.
+    least2 = np.minimum(np.square(moved).sum(axis=0), np.square(moved - common).sum(axis=0))
+    doubt2 = np.square(RULE.doubt * deviation).sum(axis=0)
+    sure_mm = np.sqrt(np.maximum(least2 - doubt2, 0.0))
     # Less at the tissue's border, where motion is often wrong.
     size_mm = inside * gaussian_filter(inside * sure_mm, RULE.smooth_mm / grid.pitch_mm, mode="constant")
     around = 2 * round(RULE.apart_mm / grid.pitch_mm) + 1
     is_place = size_mm == maximum_filter(size_mm, around, mode="constant")
     is_place &= size_mm >= max(least_mm, RULE.weakest * float(size_mm.max()))
     rows, columns = np.nonzero(is_place)
-    order = np.argsort(-size_mm[is_place], kind="stable")
+    order = np.argsort(-size_mm[is_place], kind="stable")[: RULE.most]
     points = (np.stack([columns, rows], axis=1) - (grid.size - 1) / 2) * grid.pitch_mm
     return [Place((float(points[k, 0]), float(points[k, 1])), float(size_mm[is_place][k])) for k in order]
 
 
-def place_window(places: Sequence[Place], middle: Point) -> tuple[Point, list[Place]]:
-    """The window's middle for the places of a frame, and those that it does not reach.
-
-    `places`: the strongest first; `middle`: of the frame before.
-    """
-    held, missed = list[Point](), list[Place]()
-    for place in places:
-        if _enclose([*held, place.point])[1] <= RULE.reach_mm:
-            held.append(place.point)
-        else:
-            missed.append(place)
+def place_window(places: Sequence[Point], middle: Point) -> Point:
+    """The window's middle for the places of a frame, the strongest first; `middle`: of the frame before."""
+    held = list[Point]()
+    for point in places:
+        if _enclose([*held, point])[1] <= RULE.reach_mm:
+            held.append(point)
     if any(measure_distance(point, middle) > RULE.reach_mm for point in held):
-        middle = _enclose(held)[0]
-    return middle, missed
+        return _enclose(held)[0]
+    return middle
 
 
 def measure_distance(first: Point, second: Point) -> float:
@@ -158,14 +172,14 @@ def _enclose(given: Sequence[Point]) -> tuple[Point, float]:
     return (float(x), float(y)), float(radius)
 
 
-def number_nodes() -> Ints:
+def index_nodes() -> Ints:
     """Column and row (K, 2) of the nodes that bear loads, from the middle one."""
     return np.rint(compliance.lattice().nodes / compliance.NODE_MM).astype(int)
 
 
 def join_loads(loads: Map, offsets: Sequence[Offset]) -> Map:
     """Loads (T, K, 3) at the nodes about each frame's offset as (T, 3 N) at nodes that all frames share."""
-    nodes = number_nodes()
+    nodes = index_nodes()
     places = (nodes[None] + np.array(offsets)[:, None]).reshape(-1, 2)
     shared, index = np.unique(places, axis=0, return_inverse=True)
     joined = np.zeros((len(loads), len(shared), 3), np.float32)

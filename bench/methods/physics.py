@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 from bench.methods import compliance, large_motion, posterior, relaxation
 from bench.methods.force_mixture import size_interval
 from bench.methods.large_motion import SeenMotion
-from bench.methods.load_window import LoadWindow, Offset, join_loads, number_nodes
+from bench.methods.load_window import LoadWindow, Offset, index_nodes, join_loads
 from bench.methods.method_interface import (
     Field,
     ForceEstimate,
@@ -96,7 +96,7 @@ class Physics:
         own_mm = PHYSICS.living_mm if scene.living else 0.0
         # On tissue wider than an opening a contact may be farther from the middle than loads are sought.
         is_wide = {tissue.edge for tissue in tissues} == {"free"}
-        self._window = LoadWindow(self._view, own_mm if is_wide else None)
+        self._window = LoadWindow(self._view, own_mm, is_wide)
         self._is_edge_seen = is_edge_seen(scene)
         self._frames, self._offsets = list[Observation](), list[Offset]()
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
@@ -169,7 +169,8 @@ class Physics:
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
         loads = np.stack([answer.load.astype(np.float32) for answer, *_ in posteriors])
-        joined, trusted = join_loads(loads, self._offsets), np.array(self._trusted)
+        joined = join_loads(loads, self._offsets) if self._scene.relaxation else np.zeros((len(loads), 1))
+        trusted = np.array(self._trusted)
         self.share_left = relaxation.measure_share_left(joined, times, trusted, self._scene.relaxation)
         self._loads = list(loads * self.share_left.astype(np.float32)[:, None, None])
         relaxed = [
@@ -179,18 +180,25 @@ class Physics:
 
     @property
     def view(self) -> GridView:
-        """`GRID` on the last video's pictures."""
-        return self._view
+        """`GRID` on the last video's pictures, about the last frame's loads."""
+        return self._window.view
+
+    @property
+    def centres_px(self) -> Floats:
+        """(T, 2) x, y of the middle of each frame's loads and force map, px."""
+        offsets = np.array(self._offsets, np.float64).reshape(-1, 2)
+        step_px = compliance.NODE_MM / self._view.scale_mm_per_px
+        return np.array(self._view.centre_px) + step_px * offsets
 
     def map_forces(self) -> Map:
-        """(T, N, N) magnitude of the force density in `GRID`'s cells [kPa], of the last `revise`."""
+        """(T, N, N) magnitude of the force density [kPa], of the last `revise`, in `GRID`'s cells about each
+        frame's `centres_px`."""
         assert self._scene is not None
-        young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
+        young, middle = self._scene.young_kpa or UNKNOWN_YOUNG_KPA, ((GRID.size - 1) / 2,) * 2
         maps = []
-        for load, offset in zip(self._loads, self._offsets, strict=True):
+        for load in self._loads:
             lattice, step = self._lattice(load)
-            x, y = ((GRID.size - 1) / 2 + number * step / GRID.pitch_mm for number in offset)
-            maps.append(to_image(young * lattice, (GRID.size,) * 2, (x, y), GRID.pitch_mm, step))
+            maps.append(to_image(young * lattice, (GRID.size,) * 2, middle, GRID.pitch_mm, step))
         return np.stack(maps)
 
     @property
@@ -269,7 +277,7 @@ class Physics:
     def _lattice(self, load: Map | Floats) -> tuple[Floats, float]:
         """The force density over E at the nodes of a square lattice about the middle one, and their
         distance [mm]."""
-        grid, (column, row) = compliance.lattice(), number_nodes().T
+        grid, (column, row) = compliance.lattice(), index_nodes().T
         half = max(column.max(), row.max())
         lattice = np.zeros((2 * half + 1,) * 2)
         lattice[row + half, column + half] = np.linalg.norm(load, axis=1) / grid.node_area

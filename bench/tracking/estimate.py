@@ -167,7 +167,7 @@ def apply_physics(
         estimates, reason = force_interval.bound(estimates, video, young_uncertainty, recovered_by)
         bounds_mn[trusted] = [(force.low_mn, force.high_mn) for force in estimates]
         warnings += [reason] if reason else []
-    centre = to_video_px(np.array(physics.view.centre_px), motion)
+    centres = to_video_px(physics.centres_px, motion)
     out: dict[str, Any] = {
         "density": physics.map_forces()[:, None],
         "total_force_mn": np.where(trusted, [force.size_mn for force in track.estimates], np.nan),
@@ -176,8 +176,8 @@ def apply_physics(
         "mask": physics.view.mask,
         "pitch_mm": GRID.pitch_mm,
         "scale_mm_per_px": scale / motion.shrink,
-        "centre_px": centre,
-        "centres_px": np.tile(centre, (len(trusted), 1)),
+        "centre_px": centres[-1],
+        "centres_px": centres,
         "young_kpa": UNKNOWN_YOUNG_KPA if young is None else young,
         "young_known": young is not None,
         "frame": track.index,

@@ -246,7 +246,7 @@ def probe_wide_tissue() -> Arrays:
     scale, rows, columns = 0.5, 80, 120  # mm per pixel
     y, x = (np.mgrid[:rows, :columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2) * scale
     size_mm = np.zeros((rows, columns))
-    for place, depth_mm in (((14.0, -5.0), 0.8), ((2.0, 3.0), 0.3)):
+    for place, depth_mm in (((14.0, -5.0), 1.6), ((2.0, 3.0), 0.6)):
         size_mm += depth_mm * np.exp(-(np.square(x - place[0]) + np.square(y - place[1])) / 18)
     shape = np.stack([0.4 * size_mm, 0.2 * size_mm, size_mm], axis=-1).astype(np.float32)
     arrays: Arrays = {}
