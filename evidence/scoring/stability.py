@@ -191,7 +191,7 @@ def page(data: Mapping[str, Any]) -> report.Page:
     missed = [row for row in points if judge(row) == "missed"]
     table = [
         {"change": row["change"], "recording": f"{row['kind']}, {row['cameras']}"}
-        | {name: None if row.get(key) is None else f"{row[key]:.0%}" for name, key in _COLUMNS.items()}
+        | {name: _format_share(row.get(key)) for name, key in _COLUMNS.items()}
         for row in missed
     ]
     names = dict[str, list[str]]()
@@ -199,7 +199,7 @@ def page(data: Mapping[str, Any]) -> report.Page:
         names.setdefault(outcome, []).append(name)
     stated = [
         {"stated, with all above": _GIVEN[level]}
-        | {f"{row['kind']}, {row['cameras']}": f"{row['over_time']:.0%}" for row in rows}
+        | {f"{row['kind']}, {row['cameras']}": _format_share(row["over_time"]) for row in rows}
         for (level,), rows in report.group_rows(data["undegraded"], "given").items()
     ]
     counts = {outcome: len(changes) for outcome, changes in names.items()}
@@ -217,6 +217,11 @@ def page(data: Mapping[str, Any]) -> report.Page:
         report.Section("Undegraded: mean error, of the peak", stated),
     ]
     return report.Page("Scoring: degraded recordings", data, (verdict, _CASES_ARE), sections)
+
+
+def _format_share(share: float | None) -> str | None:
+    """In per cent; None: no recording of the row has a force with an interval."""
+    return None if share is None else f"{share:.0%}"
 
 
 _COLUMNS = {
