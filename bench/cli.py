@@ -340,7 +340,7 @@ def import_(
     with counting(f"importing {source.name}", len(intake.times_s)) as progress:
         importer_registry.write_recording(intake, out, newtons, meta_keys, progress)
     notes = list(intake.notes)
-    if scale is None:
+    if scale is None and (intake.second is None or intake.second.pair is None):
         notes.append("meta.yaml still needs scale_mm_per_px or calibration")
     if not len(intake.force):
         notes.append("no force: predictions only")

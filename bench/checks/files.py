@@ -86,7 +86,7 @@ def check_stiffness(recording: Recording) -> list[Finding]:
 
 
 def check_scale(recording: Recording) -> list[Finding]:
-    """Findings on the stated or calibrated scale."""
+    """Findings on the stated, calibrated or measured scale."""
     try:
         scale = recording.scale
     except UserError as error:
@@ -116,7 +116,9 @@ def check_tissue(recording: Recording, tracked: TrackedRecording) -> list[Findin
 
 def check_pair(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on the right or depth camera."""
-    return [] if tracked.stereo is None else judge_pair(tracked.stereo, tracked.scale_mm_per_px)
+    if tracked.stereo is None:
+        return []
+    return judge_pair(tracked.stereo, None if recording.meta.is_scale_measured else tracked.scale_mm_per_px)
 
 
 def check_field_of_view(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

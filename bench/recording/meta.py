@@ -262,6 +262,11 @@ class Meta(Section):
         """Whether heart and breath may move the tissue."""
         return self.tissue == "brain"
 
+    @property
+    def is_scale_measured(self) -> bool:
+        """Whether two cameras measure the scale."""
+        return self.scale_mm_per_px is None and self.calibration is None
+
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:
         if self.scale_mm_per_px is not None and self.calibration is not None:
@@ -287,7 +292,7 @@ def document_meta() -> str:
 def read_meta(path: Path) -> Meta:
     """The recording's `meta.yaml`. UserError: no such file, not YAML, or wrong fields, one line each."""
     if not os.path.lexists(path):
-        raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px in it")
+        raise UserError(f"{path}: missing; a recording needs at least its scale in it")
     text = checked_file.read_text(path, checked_file.LARGEST_YAML)
     config = ConfigFile(text, str(path))
     return config.validate(Meta, _find_files_outside(config, path.parent))

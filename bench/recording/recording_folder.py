@@ -29,6 +29,8 @@ from bench.recording.meta import Meta
 from bench.recording.recording_scale import PixelScale, find_scale
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
+from synth.flow.recording.stereo_motion import measure_video_scale
+from synth.flow.stereo.calibration import read_rig
 from synth.job.types import Section
 from synth.system import camera_file, csv_table
 from synth.video import file_numbers
@@ -85,7 +87,19 @@ class Recording:
     @cached_property
     def scale(self) -> PixelScale:
         """Millimetres per pixel at the tissue, found once. UserError: as of `find_scale`."""
-        return find_scale(self.meta, self.folder, self.frames, self.right_frames)
+        return find_scale(self.meta, self.folder, self.frames, self._measure_scale)
+
+    def _measure_scale(self) -> float:
+        """By both cameras, on the tissue where that is drawn. UserError: as of `measure_video_scale`."""
+        assert self.meta.stereo is not None
+        path, unit_mm = self.folder / self.meta.stereo.calibration, self.meta.stereo.mm_per_unit
+        return measure_video_scale(
+            self.frames(),
+            self.right_frames(),
+            self.meta.rest_frame,
+            lambda size: read_rig(path, size[::-1], unit_mm),
+            self.tissue_mask if self.tissue or self.region else None,
+        )
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""

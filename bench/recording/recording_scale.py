@@ -13,18 +13,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.recording.meta import Meta, ScaleCalibration, Stereo
+from bench.recording.meta import Meta, ScaleCalibration
 from synth.errors import UserError
-from synth.flow.stereo.calibration import read_rig
-from synth.flow.stereo.rest import measure_scale
 from synth.video import read_video as video
 from synth.video.pixel_scale import ASSUMED_WIDTH_MM, pixel_mm
 from synth.video.read_video import Picture
 
-ReadPictures = Callable[[], Iterator[Picture]]
-
 _UNKNOWN = 0.99  # relative uncertainty of an unknown scale
-_STATED = 0.02  # relative uncertainty of a scale that is stated or that two cameras measure, unless given
+_STATED = 0.02  # relative uncertainty of a stated scale, unless given
+_MEASURED = 0.05  # of one that two cameras measure, unless given
 _POINT_PX = 1.0  # standard error of a point marked by hand
 _DISTANCE = 0.01  # relative standard error of a stated working distance
 
@@ -38,12 +35,14 @@ class PixelScale:
     source: str
 
 
-def find_scale(meta: Meta, folder: Path, pictures: ReadPictures, right_pictures: ReadPictures) -> PixelScale:
+def find_scale(
+    meta: Meta, folder: Path, pictures: Callable[[], Iterator[Picture]], measure: Callable[[], float]
+) -> PixelScale:
     """The scale that `meta.yaml` states, calibrates by a file of the folder, or leaves to two cameras;
     `Recording.scale` is this.
 
-    `pictures`: of the video, whose width is assumed in mm if the scale is unknown; `right_pictures`: of the
-    right camera. UserError: no checkerboard found, points that coincide, no picture, or a pair that does not
+    `pictures`: of the video, whose width is assumed in mm if the scale is unknown; `measure`: the scale by
+    two cameras. UserError: no checkerboard found, points that coincide, no picture, or a pair that does not
     match.
     """
     if meta.scale_mm_per_px == "unknown":
@@ -55,23 +54,8 @@ def find_scale(meta: Meta, folder: Path, pictures: ReadPictures, right_pictures:
     elif meta.calibration is not None:
         scale = _calibrate(meta.calibration, folder)
     else:
-        assert meta.stereo is not None
-        scale = _measure(meta.stereo, folder, meta.rest_frame, pictures, right_pictures)
+        scale = PixelScale(measure(), _MEASURED, "two cameras")
     return scale if meta.scale_uncertainty is None else replace(scale, uncertainty=meta.scale_uncertainty)
-
-
-def _measure(
-    stereo: Stereo, folder: Path, rest_frame: int, pictures: ReadPictures, right_pictures: ReadPictures
-) -> PixelScale:
-    """By the pictures of both cameras at rest."""
-    left, right = (
-        next((picture.rgb for picture in read() if picture.index == rest_frame), None)
-        for read in (pictures, right_pictures)
-    )
-    if left is None or right is None:
-        raise UserError(f"{folder}: no pair of frames {rest_frame}, by which two cameras measure the scale")
-    rig = read_rig(folder / stereo.calibration, left.shape[1::-1], stereo.mm_per_unit)
-    return PixelScale(measure_scale(rig, left, right), _STATED, "two cameras")
 
 
 def _calibrate(calibration: ScaleCalibration, folder: Path) -> PixelScale:

@@ -197,8 +197,8 @@ def page(data: Mapping[str, Any]) -> report.Page:
     names = dict[str, list[str]]()
     for name, outcome in outcomes.items():
         names.setdefault(outcome, []).append(name)
-    stated: list[dict[str, str | None]] = [
-        {"stated, with all above": _GIVEN[level]}
+    stated = [
+        dict[str, str | None]({"stated, with all above": _GIVEN[level]})
         | {f"{row['kind']}, {row['cameras']}": _format_share(row["over_time"]) for row in rows}
         for (level,), rows in report.group_rows(data["undegraded"], "given").items()
     ]

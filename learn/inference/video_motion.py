@@ -21,10 +21,9 @@ from synth.flow.recording.decode import Footage, RecordingFlowSettings
 from synth.flow.recording.finding import Finding, judge_scale
 from synth.flow.recording.frame_motion import FrameMotion, Size
 from synth.flow.recording.pair_findings import judge_pair
-from synth.flow.recording.stereo_motion import RightVideo
+from synth.flow.recording.stereo_motion import RightVideo, measure_video_scale
 from synth.flow.recording.video_track import track_video
 from synth.flow.stereo.calibration import read_rig
-from synth.flow.stereo.rest import measure_scale
 from synth.flow.stereo.rig import StereoRig
 from synth.flow.stereo.stereo_track import Motion3D
 from synth.job.types import PronyTerms
@@ -265,13 +264,8 @@ def _right(source: Path | Array, options: VideoOptions, second: SecondCamera, no
         return read_rig(second.calibration, size[::-1], second.mm_per_unit)
 
     if scale is None:
-        left, right = (
-            next((picture.rgb for picture in pictures if picture.index == options.rest_frame), None)
-            for pictures in (_pictures(source, options.fps), read())
-        )
-        if left is None or right is None:
-            raise UserError(f"right: no pair of frames {options.rest_frame}, by which the scale is measured")
-        scale = measure_scale(read_rig_of(left.shape[:2]), left, right)
+        frames = _pictures(source, options.fps), read()
+        scale = measure_video_scale(*frames, options.rest_frame, read_rig_of)
         notes.append(f"scale about {scale:.3g} mm/px in the middle of the picture, by both cameras")
     return RightVideo(read, read_rig_of, scale)
 

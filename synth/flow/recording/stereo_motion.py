@@ -14,7 +14,7 @@ from synth.flow.recording.camera_path import CameraTracker
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
 from synth.flow.recording.mask import MaskRight
 from synth.flow.stereo.depth_camera import DepthTracker
-from synth.flow.stereo.rest import find_depth
+from synth.flow.stereo.rest import find_depth, measure_scale
 from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.stereo_track import Motion3D, StereoTracker
 from synth.video.read_video import Picture, shrink_picture
@@ -26,7 +26,29 @@ class RightVideo:
 
     pictures: Callable[[], Iterable[Picture]]  # in order, with the numbers of the left camera's frames
     rig: Callable[[Size], StereoRig]  # of pictures of that size
-    mm_per_px: float  # stated scale of the video's pixels
+    mm_per_px: float  # scale of the video's pixels, stated or measured
+
+
+def measure_video_scale(
+    pictures: Iterable[Picture],
+    right_pictures: Iterable[Picture],
+    rest_frame: int,
+    read_rig: Callable[[Size], StereoRig],
+    tissue: Callable[[Size], Mask] | None = None,
+) -> float:
+    """Millimetres per pixel by both cameras, in the first usable frame from `rest_frame` on.
+
+    `read_rig`, `tissue`: of pictures of a size; without tissue the picture's middle counts. UserError: there
+    is no such pair of pictures, or they do not match.
+    """
+    usable = (p for p in pictures if p.index >= rest_frame and not p.damaged and p.time_s is not None)
+    left = next(usable, None)
+    right = None if left is None else next((p for p in right_pictures if p.index == left.index), None)
+    if left is None or right is None:
+        number = rest_frame if left is None else left.index
+        raise UserError(f"right: no pair of frames {number}, by which the scale is measured")
+    size = left.rgb.shape[0], left.rgb.shape[1]
+    return measure_scale(read_rig(size), left.rgb, right.rgb, None if tissue is None else tissue(size))
 
 
 @dataclass(frozen=True)

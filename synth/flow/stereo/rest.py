@@ -81,17 +81,20 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
     return Rest(np.where(refined, -flow[0], filled).astype(np.float32), matched, row_error_px)
 
 
-def measure_scale(rig: StereoRig, left: Pixels, right: Pixels) -> float:
-    """Millimetres per pixel of the left picture, (H, W, 3) like the right one, in its middle half.
+def measure_scale(rig: StereoRig, left: Pixels, right: Pixels, tissue: Mask | None = None) -> float:
+    """Millimetres per pixel of the left picture, (H, W, 3) like the right one, on the tissue (H, W), or in
+    the picture's middle half.
 
     UserError: the pictures differ in size or do not match.
     """
     height, width = left.shape[:2]
     if right.shape != left.shape:
         raise UserError(f"stereo: pictures {left.shape[:2]} and {right.shape[:2]} differ")
-    rectified, middle = Rectified(rig), np.zeros((height, width), bool)
-    middle[height // 4 : -height // 4, width // 4 : -width // 4] = True
-    depth = find_depth(rectified, left, right, rectified.flags(middle, 0))
+    if tissue is None:
+        tissue = np.zeros((height, width), bool)
+        tissue[height // 4 : -height // 4, width // 4 : -width // 4] = True
+    rectified = Rectified(rig)
+    depth = find_depth(rectified, left, right, rectified.flags(tissue, 0))
     return float(np.nanmedian(depth)) / rectified.focal
 
 

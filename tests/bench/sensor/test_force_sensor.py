@@ -102,7 +102,7 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
     def find(columns: int, rows: int) -> recording_scale.PixelScale:
         board = {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}
         return recording_scale.find_scale(
-            Meta.model_validate({"calibration": board}), tmp_path, no_pictures, no_pictures
+            Meta.model_validate({"calibration": board}), tmp_path, no_pictures, lambda: np.nan
         )
 
     scale = find(7, 5)
@@ -114,6 +114,6 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
 
 def test_scale_bar() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
-    scale = recording_scale.find_scale(about, Path(), no_pictures, no_pictures)
+    scale = recording_scale.find_scale(about, Path(), no_pictures, lambda: np.nan)
     assert scale.mm_per_px == pytest.approx(0.05)
     assert scale.uncertainty == pytest.approx(np.sqrt(2) / 100)
