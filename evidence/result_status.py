@@ -4,14 +4,16 @@ A result holds the sketches of the probes that its study needs (`evidence.guard`
 made. They are always compared with the guard of today, so that small changes of many commits add up.
 """
 
+import datetime
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evidence import report
 from evidence.guard import guard
 from evidence.guard.guard import Change, Sketches
 from evidence.report import CHECKOUT, RESULTS
@@ -72,6 +74,14 @@ def stamp(needs: Iterable[str], timed: bool = False) -> dict[str, Any]:
     """What a result stores about what it depends on: the sketches of its probes, from the stored guard."""
     today = guard.read_sketches()
     return {"timed": timed, "needs": {name: today[name] for name in needs}}
+
+
+def stamp_files(files: Iterable[Path], needs: Sequence[str], timed: bool = False) -> None:
+    """Adds commit, date and `stamp` to results that another program has written."""
+    provenance = {"commit": report.commit(), "date": datetime.date.today().isoformat()}
+    for file in files:
+        data = json.loads(file.read_text("utf-8")) | provenance | stamp(needs, timed)
+        write_whole(file, json.dumps(data, indent=1, allow_nan=False) + "\n", durable=False)
 
 
 def write_states(results: Path = RESULTS) -> None:

@@ -30,7 +30,8 @@ class Study:
     measure: Callable[..., Mapping[str, Any] | None]
     """Takes the command's arguments and options; returns the data, None if it writes files of its own."""
     result: str = ""
-    """JSON file under docs/results, a pattern if other programs write several; empty: no results."""
+    """JSON file under docs/results, or a pattern, if other programs write several into the folder of the
+    option `results`; empty: no results."""
     page: Callable[[Mapping[str, Any]], report.Page] | None = None
     """Draws the data; None: other programs draw them."""
     steps: tuple[str, ...] = ("",)
@@ -70,6 +71,10 @@ def command(name: str) -> Any:
         cv2.setNumThreads(1)
         if study.page is None:
             study.measure(**options)
+            if folder := options.get("results"):
+                files = folder.glob(study.result[study.result.index("*") :])
+                result_status.stamp_files(files, study.needs, study.timed)
+                result_status.write_states(folder)
             return
         folder = options.pop("out")
         data = dict(study.measure(**options) or {}) | result_status.stamp(study.needs, study.timed)

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import pytest
 
 from evidence import all as everything
-from evidence import report, study
+from evidence import report, result_status, study
 from evidence.all import run_steps
 from evidence.guard import guard
 from evidence.learn import shipped
@@ -64,6 +64,17 @@ def test_figures_of_a_network_card_are_those_of_the_stored_result(name: str) -> 
     figures_by_name = shipped.list_figures([row for row in rows if row["model"] == name])
     assert len(figures_by_name) == 2
     assert all(f"| {label} | {figures} |\n" in page for label, figures in figures_by_name.items())
+
+
+def test_what_other_programs_write_is_stamped_with_the_probes_it_needs(tmp_path: Path) -> None:
+    file = tmp_path / "pool.json"
+    file.write_text('{"error": 0.1}')
+    (before,) = result_status.gather(tmp_path)
+    result_status.stamp_files([file], ("score", "mesh"))
+    (after,) = result_status.gather(tmp_path)
+    assert (before.stands, after.stands) == (False, True)
+    assert (after.needs, after.commit) == (("score", "mesh"), report.commit())
+    assert json.loads(file.read_text("utf-8"))["error"] == 0.1
 
 
 def test_every_stored_result_has_its_study() -> None:
