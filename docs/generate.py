@@ -80,6 +80,9 @@ _FIELDS_HEAD = """\
 Written by `make docs`; do not edit. Sizes: a frame of 640 x 480 px; on disk by the ratio measured on rendered
 sequences.
 
+Camera axes are x right, y down, z away from the camera: a press has a positive z in `force` and `traction`.
+Both are the instruments' alone, without the pressure of a pulse.
+
 `store.flow: float16` halves the flows. A value is then rounded to 11 bits: by 0.004 px at most below 16 px of
 motion, 0.008 px below 32. The largest error of a sequence is measured while it is written: attribute
 `summary.rounding_px`. Flows are read as float32 either way.
