@@ -27,7 +27,7 @@ from evidence.curves.models import fit_ridge_on_components
 from evidence.foreign.recordings import TRUTH
 from evidence.paired_means import difference, mean_of
 from evidence.pooled import FOLDERS
-from evidence.study import Study
+from evidence.study import STEREO_MOTION, Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, GridView
 from learn.evaluation.evaluate import evaluate
@@ -544,15 +544,5 @@ STUDY = Study(
     "gap/results.json",
     page,
     ("{mission} {mission-ood} {gap-clinical} --recordings {work}/foreign --work {work}/gap-study",),
-    needs=(
-        "mesh",
-        "mechanics",
-        "picture",
-        "truth",
-        "flow",
-        "stereo",
-        "network",
-        "score-stereo",
-        "wide-tissue",
-    ),
+    needs=(*STEREO_MOTION, "network", "score-stereo", "wide-tissue"),
 )

@@ -19,6 +19,9 @@ import typer
 from evidence import report, result_status
 from learn.training.threads import set_threads
 
+STEREO_MOTION = "mesh", "mechanics", "picture", "truth", "flow", "stereo"
+"""Probes that motion depends on which two cameras recover in renders."""
+
 _HOME = Path(__file__).parent
 _DEFINED = re.compile(r"^STUDY = ", re.M)
 

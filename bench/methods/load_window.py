@@ -21,7 +21,7 @@ Offset = tuple[int, int]
 """Of the middle of a frame's loads from the tissue's, in nodes along x and y."""
 
 Point = tuple[float, float]
-"""Camera x, y from the middle of the tissue [mm]."""
+"""Camera x, y; where not said otherwise from the middle of the tissue [mm]."""
 
 
 @dataclass(frozen=True)
@@ -63,19 +63,19 @@ class LoadWindow:
         self.offset: Offset = (0, 0)
         self._middle_view, self._view = view, view
         self._own_mm = own_motion_mm
-        self.whole: GridView | None = None  # a grid that covers the tissue; None: the window stays
+        self._whole: GridView | None = None  # a grid that covers the tissue; None: the window stays
         if is_movable:
             grid = cover_tissue(view.tissue, view.centre_px, view.scale_mm_per_px)
-            self.whole = GridView(view.tissue, view.scale_mm_per_px, grid)
+            self._whole = GridView(view.tissue, view.scale_mm_per_px, grid)
         self._strongest_mm = 0.0  # largest motion of a place so far
         self._beyond = list[Place]()  # places of the last frame that the window doesn't reach
         self._missed = list[tuple[float, float]]()  # of such in two frames: motion, distance from the middle
 
     def follow(self, moved: Map, deviation: Map) -> None:
         """Moves the window to the places that move. `moved`, `deviation`: (C, H, W) mm."""
-        if self.whole is None:
+        if self._whole is None:
             return
-        view, node_mm = self.whole, compliance.NODE_MM
+        view, node_mm = self._whole, compliance.NODE_MM
         on_grid = view.mean(moved), view.mean(deviation), view.mask
         places = find_places(*on_grid, view.grid, RULE.seen_mm + self._own_mm)
         moving = [place.point for place in places if place.motion_mm >= RULE.moving_mm + self._own_mm]
@@ -95,16 +95,19 @@ class LoadWindow:
     def _find_middle(self) -> Point:
         return self.offset[0] * compliance.NODE_MM, self.offset[1] * compliance.NODE_MM
 
+    def locate(self, offset: Offset) -> Point:
+        """x, y [px] of the middle of the window at an offset."""
+        (x, y), step_px = self._middle_view.centre_px, compliance.NODE_MM / self._middle_view.scale_mm_per_px
+        return x + offset[0] * step_px, y + offset[1] * step_px
+
     @property
     def view(self) -> GridView:
         """The grid that physics observes, about the window's middle."""
-        scale, (x, y) = self._middle_view.scale_mm_per_px, self._middle_view.centre_px
-        right_mm, down_mm = self._find_middle()
-        centre_px = x + right_mm / scale, y + down_mm / scale
+        middle, centre_px = self._middle_view, self.locate(self.offset)
         if self.offset == (0, 0):
-            self._view = self._middle_view
+            self._view = middle
         elif self._view.centre_px != centre_px:
-            self._view = GridView(self._middle_view.tissue, scale, self._middle_view.grid, centre_px)
+            self._view = GridView(middle.tissue, middle.scale_mm_per_px, middle.grid, centre_px)
         return self._view
 
     @property
@@ -151,12 +154,12 @@ def find_places(moved: Map, deviation: Map, mask: Map, grid: Grid, least_mm: flo
 
 def place_window(places: Sequence[Point], middle: Point) -> Point:
     """The window's middle for the places of a frame, the strongest first; `middle`: of the frame before."""
-    held = list[Point]()
+    held_points = list[Point]()
     for point in places:
-        if _enclose([*held, point])[1] <= RULE.reach_mm:
-            held.append(point)
-    if any(measure_distance(point, middle) > RULE.reach_mm for point in held):
-        return _enclose(held)[0]
+        if _enclose([*held_points, point])[1] <= RULE.reach_mm:
+            held_points.append(point)
+    if any(measure_distance(point, middle) > RULE.reach_mm for point in held_points):
+        return _enclose(held_points)[0]
     return middle
 
 

@@ -169,9 +169,10 @@ class Physics:
         posteriors = [self._infer(frame) for frame in self._frames]
         estimates = [self._conclude(*answer, picture=False) for answer in posteriors]
         loads = np.stack([answer.load.astype(np.float32) for answer, *_ in posteriors])
-        joined = join_loads(loads, self._offsets) if self._scene.relaxation else np.zeros((len(loads), 1))
-        trusted = np.array(self._trusted)
-        self.share_left = relaxation.measure_share_left(joined, times, trusted, self._scene.relaxation)
+        self.share_left = np.ones(len(loads))
+        if terms := self._scene.relaxation:
+            joined, trusted = join_loads(loads, self._offsets), np.array(self._trusted)
+            self.share_left = relaxation.measure_share_left(joined, times, trusted, terms)
         self._loads = list(loads * self.share_left.astype(np.float32)[:, None, None])
         relaxed = [
             estimate.scale_by(share) for estimate, share in zip(estimates, self.share_left, strict=True)
@@ -186,9 +187,7 @@ class Physics:
     @property
     def centres_px(self) -> Floats:
         """(T, 2) x, y of the middle of each frame's loads and force map, px."""
-        offsets = np.array(self._offsets, np.float64).reshape(-1, 2)
-        step_px = compliance.NODE_MM / self._view.scale_mm_per_px
-        return np.array(self._view.centre_px) + step_px * offsets
+        return np.array([self._window.locate(offset) for offset in self._offsets])
 
     def map_forces(self) -> Map:
         """(T, N, N) magnitude of the force density [kPa], of the last `revise`, in `GRID`'s cells about each

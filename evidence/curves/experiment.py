@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from evidence import report, result_cache, result_status, training
 from evidence.curves import models
 from evidence.paired_means import mean_of
-from evidence.study import Study
+from evidence.study import STEREO_MOTION, Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 from learn.settings import TrainingSettings
@@ -243,5 +243,5 @@ STUDY = Study(
     "learn/curves/curves.json",
     page,
     ("{mission} {mission-ood} --work {work}/curves",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network"),
+    needs=(*STEREO_MOTION, "network"),
 )

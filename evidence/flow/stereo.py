@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from evidence import report, result_status
-from evidence.study import Study
+from evidence.study import STEREO_MOTION, Study
 from synth.arrays import Array, Mask
 from synth.dataset.store import Dataset, Sequence
 
@@ -106,5 +106,5 @@ STUDY = Study(
     "flow/stereo/stereo.json",
     page,
     ("{stereo-640} {stereo-320}",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo"),
+    needs=STEREO_MOTION,
 )

@@ -8,7 +8,7 @@ from typing import Any
 from evidence import report, result_status
 from evidence.curves import models
 from evidence.curves.experiment import figures
-from evidence.study import Study
+from evidence.study import STEREO_MOTION, Study
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
@@ -121,5 +121,5 @@ STUDY = Study(
     "learn/shipped/shipped.json",
     page,
     ("{mission} {mission-ood} --cache {work}/clips",),
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network"),
+    needs=(*STEREO_MOTION, "network"),
 )

@@ -21,7 +21,7 @@ from bench.methods.network import Model
 from bench.methods.physics import Physics
 from evidence import report, result_cache, result_status
 from evidence.paired_means import mean_of
-from evidence.study import Study
+from evidence.study import STEREO_MOTION, Study
 from learn.inference.predict import load_model
 from learn.inference.shipped_networks import NAMES
 from synth.dataset.dataset_folder import read_relaxation
@@ -210,16 +210,5 @@ STUDY = Study(
     "scoring/fusion/fusion.json",
     page,
     ("{mission-ood} --clinical {gap-clinical} --work {work}/fusion",),
-    needs=(
-        "mesh",
-        "mechanics",
-        "picture",
-        "truth",
-        "flow",
-        "stereo",
-        "network",
-        "score",
-        "score-stereo",
-        "wide-tissue",
-    ),
+    needs=(*STEREO_MOTION, "network", "score", "score-stereo", "wide-tissue"),
 )
