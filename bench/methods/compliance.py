@@ -185,9 +185,10 @@ def _hold_alone(geometry: _Geometry, tissue: TissueKind) -> Floats:
 
 
 Block = Literal["held", "free"]
+_BLOCKS = 2  # kept in memory: where the tissue's edge isn't seen a search goes from one to the other
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=_BLOCKS)
 def _condense(block: Block, poisson: float) -> _Surface:
     geometry = _geometry(block)
     volume = next(iter(geometry.volumes.values()))
@@ -201,7 +202,7 @@ def _condense(block: Block, poisson: float) -> _Surface:
     return _Surface(geometry, outer_part, coupling, np.asfortranarray(stiffness[inner, inner]))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=_BLOCKS)
 def _geometry(block: Block) -> _Geometry:
     edges: tuple[Edge, ...] = ("free",) if block == "free" else ("bonded", "slipping")
     volumes, grid = {edge: _mesh(_TETS, edge) for edge in edges}, lattice()

@@ -9,6 +9,7 @@ import numpy as np
 from synth.arguments import checked
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
+from synth.flow import image
 from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Estimator, create
 from synth.flow.segmentation import with_highlights
@@ -23,6 +24,8 @@ class Tracking:
     min_visible: float = 0.02  # unmasked share of the tissue; a frame with less is lost
     min_gain: float = 0.2  # in confidence, for which surroundings are used; they cost 10% error (design.md)
     max_tries: int = 3  # frames in which surroundings are tried, to limit the time
+    lost_px: float = 1.0  # from the flow that continues the sure one, from which lost flow counts as wrong
+    min_lost: float = 0.02  # share of the visible tissue with such flow, from which a frame is solved again
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,22 @@ class Tracker:
                 if retry.level > solution.level:
                     solution, self.resets = retry, self.resets + 1
             solution = self._try_surroundings(frame, blocked, solution)
-        return self.accept(solution)
+        return self.accept(self._solve_lost(frame, blocked, solution))
+
+    def _solve_lost(self, frame: Pixels, blocked: Mask, solution: Solution) -> Solution:
+        """Solves a frame again if its flow is lost where it differs from that of the sure tissue around.
+
+        Still tissue beside a contact that moves by many pixels takes on its motion on coarse levels, finds no
+        match there, and would pass the wrong flow on to the next frame.
+        """
+        visible, is_sure = self.usable & ~blocked, solution.confidence >= LOW_CONFIDENCE
+        planes = np.ascontiguousarray(solution.flow.transpose(2, 0, 1))
+        start = np.stack([image.fill(plane, image.flags(is_sure)) for plane in planes], axis=-1)
+        is_wrong = visible & ~is_sure & (np.linalg.norm(start - solution.flow, axis=-1) > Tracking.lost_px)
+        if is_wrong.sum() <= Tracking.min_lost * visible.sum():
+            return solution
+        retry = self.solve(frame, blocked, start)
+        return retry if retry.level > solution.level else solution
 
     def _try_surroundings(self, frame: Pixels, blocked: Mask, solution: Solution) -> Solution:
         """Includes the surroundings, here and in all later frames, if confidence in the tissue rises enough.
