@@ -3,11 +3,12 @@
 The linear inverse errs by 15 to 40% where loads are tenths of a newton. There springs join every visible
 point of the surface to the place d_p where it was seen,
 
-    W(u) + 1/2 sum k |u_p - d_p|^2 -> min,
+    W(u) + 1/2 sum k_p |u_p - d_p|^2 -> min,
 
-W the energy of a block under Ogden's law; the springs' ends are then moved on by what tissue lags. The pull
-of those at the contact, where tissue moves by a quarter of the largest motion, is the force: neither its
-place nor its form has to be found, and where the tissue's edge is seen, what holds it hardly matters.
+W the energy of a block under Ogden's law, k_p less where the motion is less certain; the springs' ends are
+then moved on by what tissue lags. The pull of those at the contact, where tissue moves by a quarter of the
+largest motion, is the force: neither its place nor its form has to be found, and where the tissue's edge is
+seen, what holds it hardly matters.
 
 Where it is not seen, it lies between what is seen and far away. An opening that is too small resists the
 motion at the picture's border, one that is too wide lets go of it: springs beside the contact then pull with
@@ -36,8 +37,10 @@ from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import assemble
 
-STEEP = 0.3
-"""Slope of the motion, mm per mm and after smoothing, beyond which it is large."""
+STEEP = {2: 0.3, 3: 0.15}
+"""By its components: slope of the motion, mm per mm and after smoothing, beyond which it is large. From two
+components no force is solved, so that of them only what surely leaves the linear range counts."""
+_SURE_MM = 0.6  # deviation of a motion whose spring is half as firm: what is hardly known imposes less
 _TETS = 1600
 _FIRM_PER_MM = 8.0  # k over E and area, as of a driven contact of 5 mm
 _LEAST_JACOBIAN = 0.1
@@ -57,6 +60,7 @@ class SeenMotion:
 
     points: Floats  # (P, 2) mm from the middle of the grid, camera x and y
     moved: Floats  # (P, C) mm, camera axes
+    firmness: Floats  # (P,) 0..1, of a point's spring over that of a point whose motion is certain
     area_mm2: float  # of a point
     slope: float  # largest slope, mm per mm
 
@@ -78,12 +82,13 @@ def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMot
     least_mm, most_mm = _SMOOTH_MM
     slopes = np.array(np.gradient(smooth(most_mm), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
     slope = np.linalg.norm(slopes, axis=(0, 1))[inside].max(initial=0.0)
-    spread = float(np.median(deviation[:, inside].max(axis=0)))
-    mean = smooth(min(max(_PER_MM * spread, least_mm), most_mm))
+    spread = deviation[:, inside].max(axis=0)
+    mean = smooth(min(max(_PER_MM * float(np.median(spread)), least_mm), most_mm))
+    firmness = 1 / (1 + np.square(spread / _SURE_MM, dtype=np.float64))
     rows, columns = np.nonzero(inside)
     places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
     points = np.asarray(places * grid.pitch_mm, np.float64)
-    return SeenMotion(points, mean[:, inside].T, grid.pitch_mm**2, float(slope))
+    return SeenMotion(points, mean[:, inside].T, firmness, grid.pitch_mm**2, float(slope))
 
 
 def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float | None, alpha: float) -> Floats:
@@ -118,8 +123,8 @@ def _pull(
     sheet = MembraneSheet(tissue.membrane, max(tissue.stretch, _LEAST_STRETCH)) if tissue.membrane else None
     system = assemble(volume, "ogden", tissue.poisson, sheet, alpha)
     value, size = embedding.value, np.linalg.norm(motion.moved, axis=1)
-    stiffness = _FIRM_PER_MM * motion.area_mm2
-    nodal = stiffness * (value.T @ value)
+    stiffness = _FIRM_PER_MM * motion.area_mm2 * motion.firmness[:, None]
+    nodal = value.T @ sp.diags_array(stiffness[:, 0]) @ value
     balance = Balance(system, sp.csr_array(sp.kron(nodal, np.eye(3), format="csr")))
     observed = targets = motion.moved @ TO_CAMERA
     u, energy, part, step = np.zeros_like(volume.points), 0.0, 0.0, _FIRST
@@ -127,7 +132,7 @@ def _pull(
         next_part = min(part + step, 1.0)
         start = u * (next_part / part) if part else u
         try:
-            pull = next_part * stiffness * (value.T @ targets)
+            pull = next_part * (value.T @ (stiffness * targets))
             u, _, energy, _ = balance.find(pull, start, u, energy, _LEAST_JACOBIAN)
         except ExcessiveLoad:
             step *= 0.5
@@ -137,7 +142,7 @@ def _pull(
             part = next_part
     for _ in range(_REFINEMENTS):  # the springs' ends are moved on by as much as the tissue lags
         targets = targets + observed - value @ u
-        u, _, energy, _ = balance.find(stiffness * (value.T @ targets), u, u, energy, _LEAST_JACOBIAN)
+        u, _, energy, _ = balance.find(value.T @ (stiffness * targets), u, u, energy, _LEAST_JACOBIAN)
     traction, contact = stiffness * (targets - value @ u), size >= _MOVED * size.max()
     return TO_CAMERA @ traction[contact].sum(axis=0), TO_CAMERA @ traction[~contact].sum(axis=0)
 

@@ -34,7 +34,8 @@ Case = dict[str, Any]  # input of the methods: `cameras`, and what is stated, on
 _USUAL, _CLINICAL = "as mission", "clinical"
 _STATED = "nothing", "membrane", "membrane and its stiffness"
 _WITH_RELAXATION = f"{_STATED[-1]}, relaxation"
-_LIVING = "nothing, and it may pulsate"  # with all others it is stated that nothing does
+_LIVING = "nothing, and it may pulsate"  # with the others it is stated that nothing does
+_LIVING_STATED = "membrane, and it may pulsate"
 _MEASURED = 1.25  # factor of the true stiffness, up and down, that is stated
 _CONTROL = "control: another video's force"
 _STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
@@ -57,7 +58,7 @@ def _score(data: Path, work: Path, every: int) -> list[dict[str, Any]]:
     """Rows of one dataset; see `measure`."""
     rows = []
     relaxation = read_relaxation(Dataset(data).paths[0])
-    cases = (_LIVING, *_STATED, _WITH_RELAXATION) if relaxation else (_LIVING, *_STATED)
+    cases = (_LIVING, _LIVING_STATED, *_STATED, *[_WITH_RELAXATION] * bool(relaxation))
     for cameras, stated in product((1, 2), cases):
         model = Model(load_model(NAMES[0])) if cameras == 2 else None  # none is shipped for one camera
         case: Case = {"cameras": cameras, "stated": stated}
@@ -93,7 +94,7 @@ def _estimate(sequence: Stored, case: Case, model: Model | None) -> dict[str, An
         sequence.attrs["scale_mm_per_px"],
         sequence.attrs["young_kpa"],
         "unknown" if case["stated"] in (_LIVING, "nothing") else membrane,
-        living=case["stated"] == _LIVING,
+        living=case["stated"] in (_LIVING, _LIVING_STATED),
         membrane_mn_per_mm=(stiffness / _MEASURED, stiffness * _MEASURED)
         if stiffness and case["stated"] in (_STATED[-1], _WITH_RELAXATION)
         else None,
@@ -161,10 +162,19 @@ def page(data: Mapping[str, Any]) -> report.Page:
         for row in usual
         if (row["method"], row["tissue"]) == (PHYSICS, "intact")
     ]
+    clinical = by_loads.get((_CLINICAL,), [])
+    of_tissue = {
+        (row["cameras"], row["stated"], row["method"], row["tissue"]): report.mean_cell(row["whole"], ".0%")
+        for row in clinical
+    }
     clinical_rows = [
         {"cameras": row["cameras"], "stated": row["stated"], "method": row["method"]}
         | {"sequences": row["sequences"], **_cells(row)}
-        for row in by_loads.get((_CLINICAL,), ())
+        | {
+            label: of_tissue.get((row["cameras"], row["stated"], row["method"], tissue))
+            for tissue, label in (("stripped", "force, bare"), ("intact", "force, under a pia"))
+        }
+        for row in clinical
         if row["tissue"] == "all"
     ]
     by_method = {(row["cameras"], row["method"]): row for row in unknown if row["tissue"] == "all"}

@@ -24,8 +24,28 @@ SCENES = FELUPE["openings"]
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: f"{scene['alpha']:g}")
 def test_the_force_behind_felupes_motion_is_found(scene: dict) -> None:  # type: ignore[type-arg]
     comparison = compare_estimate(scene)
-    assert comparison["slope"] > large_motion.STEEP
+    assert comparison["slope"] > max(large_motion.STEEP.values())
     assert comparison["force_error"] <= 0.12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES[1:3], ids=lambda scene: f"{scene['alpha']:g}")
+def test_motion_that_is_hardly_known_imposes_less(scene: dict) -> None:  # type: ignore[type-arg]
+    """Beside felupe's contact a strip is seen 1.5 mm off, as flow that is lost is."""
+    grid = physics.GRID
+    axis = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
+    x, y = np.meshgrid(axis, axis)
+    displacement, force = motion_of(scene, x, y)
+    moved, strip, errors = np.moveaxis(displacement, -1, 0).copy(), x < -7, []
+    moved[0, strip] = 1.5
+    for stated_mm in (0.01, 2.0):
+        deviation = np.full(moved.shape, 0.01)
+        deviation[:, strip] = stated_mm
+        motion = large_motion.measure_motion(moved, deviation, np.hypot(x, y) < OPENING_MM, grid)
+        tissue = TissueKind("bonded", 0.0, scene["poisson"])
+        answer = large_motion.reaction(motion, tissue, OPENING_MM, scene["alpha"])
+        errors.append(np.linalg.norm(answer - force) / np.linalg.norm(force))
+    assert errors[1] < 0.4 * errors[0]
 
 
 @pytest.mark.parametrize("opening_mm", [18.0, pytest.param(25.0, marks=pytest.mark.slow)])

@@ -37,10 +37,11 @@ def estimate_loads(*contacts: tuple[tuple[float, float], float]) -> tuple[Physic
 def test_a_contact_far_from_the_middle_is_estimated_like_one_in_the_middle() -> None:
     """Sought about the middle alone, the second force was 0.6 of the true one and the third 0.4."""
     sizes, cells = list[float](), np.indices((48, 48))[::-1] - 23.5
+    share = 0.6  # the half-space's theory is linear, as is physics of so little motion
     for place in ((0.0, 0.0), (14.0, -5.0), (-22.0, 10.0)):
-        method, estimate = estimate_loads((place, 1.0))
+        method, estimate = estimate_loads((place, share))
         # The block's walls are fixed 50 mm away, where the half-space still sinks.
-        assert estimate.force_mn == pytest.approx(FORCE, abs=0.25 * 32)
+        assert estimate.force_mn == pytest.approx(share * FORCE, abs=0.25 * share * 32)
         assert not method.warnings
         sizes.append(float(np.linalg.norm(estimate.force_mn)))
         density = method.map_forces()[-1]

@@ -134,6 +134,32 @@ def test_surroundings_are_tracked_where_tissue_alone_has_low_confidence(alone: f
     assert sum(estimator.widened_calls) <= (6 if widened else 3), "tries with the surroundings are limited"
 
 
+class _NearSighted:
+    """An estimator of still tissue that finds what is within 2 px of where it starts."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def flow(self, rest, now, rest_usable, now_usable, initial=None):  # type: ignore[no-untyped-def]
+        self.calls += 1
+        start = np.zeros((*rest_usable.shape, 2), "f4") if initial is None else initial
+        is_near = np.linalg.norm(start, axis=-1) < 2
+        return start * ~is_near[..., None], is_near.astype("f4")
+
+
+@pytest.mark.parametrize("columns", [8, 1])
+def test_flow_that_is_lost_beside_sure_flow_is_solved_again_from_that(columns: int) -> None:
+    picture, tissue, estimator = np.zeros((64, 64, 3), np.uint8), np.ones((64, 64), bool), _NearSighted()
+    tracker = track.Tracker(estimator, picture, ~tissue, tissue)
+    tracker.initial = np.zeros((64, 64, 2), np.float32)
+    tracker.initial[:, :columns] = 12.0  # what moved there is gone
+    flow, confidence = tracker.step(picture, ~tissue)
+    is_wide = columns == 8
+    assert estimator.calls == (2 if is_wide else 1), "one column is not worth the time"
+    assert np.abs(flow).max() == (0 if is_wide else 12)
+    assert confidence.min() == is_wide
+
+
 def test_a_warp_solves_the_linear_system_that_its_energy_has_without_clipping() -> None:
     """Where |grad w| < h the energy of a warp is quadratic: SciPy solves its normal equations."""
     rng, shape = np.random.default_rng(3), (20, 27)
