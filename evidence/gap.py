@@ -544,5 +544,5 @@ STUDY = Study(
     "gap/results.json",
     page,
     ("{mission} {mission-ood} {gap-clinical} --recordings {work}/foreign --work {work}/gap-study",),
-    needs=(*STEREO_MOTION, "network", "score-stereo", "wide-tissue"),
+    needs=(*STEREO_MOTION, "lost-flow", "network", "score-stereo", "wide-tissue"),
 )

@@ -60,7 +60,7 @@ class SeenMotion:
 
     points: Floats  # (P, 2) mm from the middle of the grid, camera x and y
     moved: Floats  # (P, C) mm, camera axes
-    firmness: Floats  # (P,) 0..1, of a point's spring over that of a point whose motion is certain
+    firmness: Floats  # (P,) 0..1, of a point's spring over that of the surest point
     area_mm2: float  # of a point
     slope: float  # largest slope, mm per mm
 
@@ -85,6 +85,7 @@ def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMot
     spread = deviation[:, inside].max(axis=0)
     mean = smooth(min(max(_PER_MM * float(np.median(spread)), least_mm), most_mm))
     firmness = 1 / (1 + np.square(spread / _SURE_MM, dtype=np.float64))
+    firmness /= firmness.max(initial=1e-9)
     rows, columns = np.nonzero(inside)
     places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
     points = np.asarray(places * grid.pitch_mm, np.float64)

@@ -33,6 +33,7 @@ from learn.split import Split
 from synth.arrays import Mask, Pixels
 from synth.dataset.store import Dataset
 from synth.fem import surface_embedding
+from synth.flow import track
 from synth.flow.segmentation import segment
 from synth.flow.stereo import stereo_track as stereo_track
 from synth.flow.stereo.calibration import read_rig
@@ -162,6 +163,17 @@ def probe_flow() -> Arrays:
     }
 
 
+def probe_lost_flow() -> Arrays:
+    """Flow of a picture pulled by 5 px, from a flow that is wrong by 20 px in a strip at its border."""
+    left, _, tissue = _read_pictures("stereo", "frames")
+    pictures, bars = _pull_picture(left[0])
+    tracker = track.Tracker("tvl1", pictures[0], bars[0], np.ones_like(tissue))
+    tracker.initial = np.zeros((*tissue.shape, 2), np.float32)
+    tracker.initial[:, :24, 0] = 20.0
+    flow, confidence = tracker.step(pictures[1], bars[1])
+    return {"flow": flow, "confidence": confidence}
+
+
 def probe_stereo() -> Arrays:
     """Motion in three dimensions of a stored recording, given a flow of closed form."""
     left, blocked, tissue = _read_pictures("stereo", "frames")
@@ -271,6 +283,7 @@ PROBES: Mapping[str, Probe] = {
     "picture": Probe(probe_picture, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
     "truth": Probe(probe_truth, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
     "flow": Probe(probe_flow, 1e-2, ("MOTION",), ("synth/flow",)),
+    "lost-flow": Probe(probe_lost_flow, 1e-2, ("MOTION",), ("synth/flow",)),
     "stereo": Probe(probe_stereo, 1e-2, ("MOTION",), ("synth/flow/stereo",)),
     "network": Probe(probe_network, 1e-2, ("TRAINING", "CLIPS"), ("learn", "synth/flow/onnx_network")),
     "compliance": Probe(probe_compliance, 1e-3, ("COMPLIANCE", "MESH"), ("bench/methods",)),

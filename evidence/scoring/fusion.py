@@ -220,5 +220,5 @@ STUDY = Study(
     "scoring/fusion/fusion.json",
     page,
     ("{mission-ood} --clinical {gap-clinical} --work {work}/fusion",),
-    needs=(*STEREO_MOTION, "network", "score", "score-stereo", "wide-tissue"),
+    needs=(*STEREO_MOTION, "lost-flow", "network", "score", "score-stereo", "wide-tissue"),
 )
