@@ -96,10 +96,12 @@ class Tracker:
         match there, and would pass the wrong flow on to the next frame.
         """
         visible, is_sure = self.usable & ~blocked, solution.confidence >= LOW_CONFIDENCE
+        is_lost, most = visible & ~is_sure, Tracking.min_lost * visible.sum()
+        if is_lost.sum() <= most:
+            return solution
         planes = np.ascontiguousarray(solution.flow.transpose(2, 0, 1))
         start = np.stack([image.fill(plane, image.flags(is_sure)) for plane in planes], axis=-1)
-        is_wrong = visible & ~is_sure & (np.linalg.norm(start - solution.flow, axis=-1) > Tracking.lost_px)
-        if is_wrong.sum() <= Tracking.min_lost * visible.sum():
+        if (is_lost & (np.linalg.norm(start - solution.flow, axis=-1) > Tracking.lost_px)).sum() <= most:
             return solution
         retry = self.solve(frame, blocked, start)
         return retry if retry.level > solution.level else solution
