@@ -56,7 +56,7 @@ class PhysicsConstants:
     solved: int = 4  # frames so solved, at most
     linear: float = 14.4  # largest force over E [mm^2] in the linear range: P = 0.4 of a contact of 6 mm
     most_gain: float = 4.0
-    apart: float = 1.8
+    most_ratio: float = 1.8
     """Gain, and ratio of the gains of both ends, beyond which the motion is taken for wrong: in 51 sequences
     of `mission-ood` and `clinical` of right motion they were up to 3.8 and 1.6, in two of wrong motion 4.4 to
     7.4 and 1.8 to 2.8."""
@@ -328,7 +328,7 @@ def find_gains(
             sizes = [float(np.linalg.norm(force)) / size for force in forces]
         except ExcessiveLoad:
             sizes = [np.inf]
-        if max(sizes) <= min(PHYSICS.most_gain, PHYSICS.apart * min(sizes)):
+        if max(sizes) <= min(PHYSICS.most_gain, PHYSICS.most_ratio * min(sizes)):
             ends = min(sizes), max(sizes)
         else:
             unsolved += 1

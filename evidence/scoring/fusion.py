@@ -162,21 +162,7 @@ def page(data: Mapping[str, Any]) -> report.Page:
         for row in usual
         if (row["method"], row["tissue"]) == (PHYSICS, "intact")
     ]
-    clinical = by_loads.get((_CLINICAL,), [])
-    of_tissue = {
-        (row["cameras"], row["stated"], row["method"], row["tissue"]): report.mean_cell(row["whole"], ".0%")
-        for row in clinical
-    }
-    clinical_rows = [
-        {"cameras": row["cameras"], "stated": row["stated"], "method": row["method"]}
-        | {"sequences": row["sequences"], **_cells(row)}
-        | {
-            label: of_tissue.get((row["cameras"], row["stated"], row["method"], tissue))
-            for tissue, label in (("stripped", "force, bare"), ("intact", "force, under a pia"))
-        }
-        for row in clinical
-        if row["tissue"] == "all"
-    ]
+    clinical_rows = _tabulate_clinical(by_loads.get((_CLINICAL,), []))
     by_method = {(row["cameras"], row["method"]): row for row in unknown if row["tissue"] == "all"}
     mono, stereo, fusion = by_method[1, PHYSICS], by_method[2, PHYSICS], by_method[2, FUSION]
     living = {
@@ -205,6 +191,23 @@ def page(data: Mapping[str, Any]) -> report.Page:
         )
         sections.append(report.Section("Clinical loads", clinical_rows, clinical_words))
     return report.Page("Physics, network, and their fusion", data, words, sections)
+
+
+def _tabulate_clinical(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of all tissue, with the error of bare and of covered tissue next to it."""
+
+    def key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        return row["cameras"], row["stated"], row["method"]
+
+    force = {(*key(row), row["tissue"]): report.mean_cell(row["whole"], ".0%") for row in rows}
+    return [
+        dict(zip(("cameras", "stated", "method"), key(row), strict=True))
+        | {"sequences": row["sequences"], **_cells(row)}
+        | {"force, bare": force.get((*key(row), "stripped"))}
+        | {"force, under a pia": force.get((*key(row), "intact"))}
+        for row in rows
+        if row["tissue"] == "all"
+    ]
 
 
 def _cells(row: Mapping[str, Any]) -> dict[str, str]:
