@@ -31,6 +31,17 @@ DATASETS: Mapping[str, tuple[str, ...]] = {
     "mission": ("mission", "sequences=375"),  # as many as the stored gap is of
     "mission-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80"),
     "gap-clinical": ("clinical", "sequences=40", "frames=8", "fps=2.5", "render.stereo_mm=24", *_SMALL),
+    "pulsating": (
+        "mission",
+        "seed=774",
+        "sequences=16",
+        "frames=40",
+        "fps=1.5",
+        "fem.pulse={heart_mm: [0.1, 0.5], breath_mm: [0.1, 1.0]}",
+        "fem.membrane.probability=0.4",
+        "fem.travel_mm=[0.4, 6]",
+        "fem.instruments=[1, 1]",
+    ),
     "paper": (
         "paper",
         "sequences=90",

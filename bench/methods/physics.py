@@ -63,10 +63,23 @@ class PhysicsConstants:
     unsolved: tuple[float, float] = (0.8, 2.0)
     """Gains of the linear force that hold what it may be where motion is large and not solved: those of nine
     driven contacts of 75 to 260 mN were 0.93 to 1.6."""
+    own: float = 0.8
+    """Largest amplitude of the tissue's own motion that is taken off large motion, in deviations of modes:
+    the peak of a sinusoid from rest is 1.6 of its root mean square, which `MODEL.unmet` doubles. The linear
+    inverse finds more, as its own motion takes up what loads don't explain."""
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
 
 
 PHYSICS = PhysicsConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class LargeFrame:
+    """A frame whose motion leaves the linear range."""
+
+    observation: Observation  # about the middle of the loads
+    motion: SeenMotion
+    middle_mm: Floats  # (2,) of the loads from the middle of the motion's grid, camera x and y
 
 
 @dataclass(frozen=True)
@@ -107,7 +120,7 @@ class Physics:
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, no_motion = tissues[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
-        self._large, self._gains = list[tuple[Observation, SeenMotion]](), NO_GAIN
+        self._large, self._gains = list[LargeFrame](), NO_GAIN
         self._weights = TissueWeights(first, np.ones(1), no_motion, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
@@ -131,13 +144,14 @@ class Physics:
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
         if frame.trusted:
+            middle_mm = np.zeros(2)
             if self._is_edge_seen and view is not self._view:  # an opening is about the tissue's middle
-                view = self._view
+                view, middle_mm = self._view, compliance.NODE_MM * np.array(self._window.offset)
                 moved, spread = (view.mean(field) for field in fields)
             surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
-            least_slope = self._large[-1][1].slope * PHYSICS.steeper if self._large else 0.0
+            least_slope = self._large[-1].motion.slope * PHYSICS.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP[len(moved)], least_slope):
-                self._large.append((observation, surface))
+                self._large.append(LargeFrame(observation, surface, middle_mm))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
         if observation.signal_mm > max(PHYSICS.growth * self._weighed_mm, posterior.MODEL.least_mm):
@@ -309,18 +323,17 @@ def turning_factor(share: Floats | float) -> Floats:
     return np.asarray(1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6))
 
 
-def find_gains(
-    scene: MethodContext, weights: TissueWeights, large: Sequence[tuple[Observation, SeenMotion]]
-) -> Gains:
+def find_gains(scene: MethodContext, weights: TissueWeights, large: Sequence[LargeFrame]) -> Gains:
     """Gains of frames with large motion, of rising slope, on the middle tissue; few of them are solved."""
     tissue, radius = weights.middle, np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     opening_mm = min(float(radius), large_motion.OPEN_MM) if is_edge_seen(scene) else None
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
-    for frame, motion in large[::-2][: PHYSICS.solved]:
-        size = float(np.linalg.norm(infer(weights, frame).force.mean))
+    for frame in large[::-2][: PHYSICS.solved]:
+        linear = infer(weights, frame.observation)
+        size = float(np.linalg.norm(linear.force.mean))
         if size == 0:
             continue
-        ends = PHYSICS.unsolved
+        ends, motion = PHYSICS.unsolved, take_off_own_motion(frame, weights.own_mm, linear.own)
         try:
             forces = [
                 large_motion.reaction(motion, tissue, opening_mm, alpha) for alpha in sorted(set(scene.alpha))
@@ -335,6 +348,14 @@ def find_gains(
         rows.append((size, *ends))
     size_mn, low, high = np.array(sorted(rows)).T
     return Gains(size_mn, low, high, unsolved)
+
+
+def take_off_own_motion(frame: LargeFrame, own_mm: Floats, amplitudes: Floats) -> SeenMotion:
+    """What loads move: no force at the surface causes the tissue's own motion, `own_mm` (C, 6, M) by its
+    amplitudes (M,)."""
+    own = own_mm @ amplitudes.clip(-PHYSICS.own, PHYSICS.own)
+    moved_mm = posterior.polynomials(frame.motion.points - frame.middle_mm) @ own.T
+    return replace(frame.motion, moved=frame.motion.moved - moved_mm)
 
 
 def find_monocular_gains(weights: TissueWeights, strongest: Observation, is_steep: bool) -> Gains:

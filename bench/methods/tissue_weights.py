@@ -212,8 +212,14 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     return Posterior(
         float(weight @ [answer.evidence for answer in posteriors]),
         mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
-        sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
+        _mean(weight, [answer.load for answer in posteriors]),
+        _mean(weights.weight, [answer.own for answer in posteriors[: len(weights.tissues)]]),
     )
+
+
+def _mean(weight: Floats, values: Sequence[Floats]) -> Floats:
+    """Mean of arrays of equal shape, weights of sum 1."""
+    return np.asarray(np.tensordot(weight, np.stack(values), axes=1))
 
 
 def describe(weights: TissueWeights, scene: MethodContext) -> str:

@@ -370,5 +370,5 @@ STUDY = Study(
     measure,
     "learn/foreign/*/pool.json",
     steps=("{work}/foreign {mechanics_python} {pictures_python}",),
-    needs=("score", "score-stereo", "wide-tissue"),
+    needs=("score", "score-stereo", "wide-tissue", "pulse"),
 )

@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -277,6 +278,32 @@ def probe_wide_tissue() -> Arrays:
     return arrays
 
 
+def probe_pulse() -> Arrays:
+    """Forces by physics, with two cameras, of small and large dents in pulsating tissue, with a span without
+    contact and with none."""
+    scale, side = 0.3, 80  # mm per pixel
+    y, x = (np.mgrid[:side, :side] - (side - 1) / 2) * scale
+    tissue, radius = np.hypot(x, y) < 11.5, np.hypot(x, y) / 12
+    depth_mm = np.exp(-(np.square(x - 2) + np.square(y + 1)) / 40)
+    dent = np.stack([0.4 * depth_mm, 0.2 * depth_mm, depth_mm], axis=-1)
+    rise = np.stack([0.1 * x / 12, 0.05 * y / 12, 0.3 * radius**2 - 0.3], axis=-1)
+    seconds = np.arange(9)
+    phases, loads = 0.5 - 0.5 * np.cos(0.44 * np.pi * seconds), np.clip(seconds - 5, 0, None) / 3
+    arrays: Arrays = {}
+    with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
+        for most_mm, free in product((0.4, 2.5), (6, 0)):
+            method, sure = Physics(), np.ones((side, side), np.float32)
+            scene = MethodContext(tissue, scale, 5.0, "stripped", (0.45, 0.45), True)
+            for second, phase, load in zip(seconds, phases, loads, strict=True):
+                moved = (phase * rise + most_mm * load * dent).astype(np.float32)
+                seen = Motion3D(moved, np.full_like(moved, 0.01))
+                frame = FrameMotion(moved[..., :2] / scale, sure, motion=seen, time_s=float(second))
+                method(frame, scene, False)
+            estimates = method.revise(seconds < free)
+            arrays[f"force, {most_mm:g} mm, {free} free"] = [estimate.force_mn for estimate in estimates]
+    return arrays
+
+
 PROBES: Mapping[str, Probe] = {
     "mesh": Probe(probe_mesh, 1e-4, ("MESH",), ("synth/fem/mesh", "synth/geometry", "synth/render/anatomy")),
     "mechanics": Probe(probe_mechanics, 1e-4, ("CONTENT",), ("synth/fem", "synth/sequence", "synth/job")),
@@ -300,6 +327,7 @@ PROBES: Mapping[str, Probe] = {
         ("bench", "synth/flow/recording", "synth/video", "learn/inference"),
     ),
     "wide-tissue": Probe(probe_wide_tissue, 3e-2, ("SCORING", "COMPLIANCE"), ("bench/methods",)),
+    "pulse": Probe(probe_pulse, 3e-2, ("SCORING", "COMPLIANCE"), ("bench/methods",)),
 }
 """By name; the order is that of the pipeline."""
 

@@ -241,5 +241,5 @@ STUDY = Study(
     "scoring/stability/stability.json",
     page,
     ("{work}/degraded",),
-    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
+    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo", "pulse"),
 )

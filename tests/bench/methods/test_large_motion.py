@@ -100,3 +100,30 @@ def test_large_forces_are_estimated_or_said_to_be_out_of_range(
     else:
         assert np.isnan([answer.low_mn, answer.high_mn]).all()
     assert bool(method.warnings) == (cameras == 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "share", "error"), [(0, 0.4, 0.05), (1, 0.4, 0.05), (0, 0.1, 0.25), (3, 0.1, 0.35)]
+)
+def test_the_tissues_own_motion_is_not_taken_for_force(number: int, share: float, error: float) -> None:
+    """Tissue rises by 0.3 mm, alone for ten seconds, then while a share of felupe's contact pulls it."""
+    scene, side, scale = SCENES[number], 120, 0.22
+    axis = (np.arange(side) - (side - 1) / 2) * scale
+    x, y = np.meshgrid(axis, axis)
+    displacement, _ = motion_of(scene, x, y)
+    radius = np.hypot(x, y) / OPENING_MM
+    own_motion = np.stack([0.1 * x / OPENING_MM, 0.1 * y / OPENING_MM, 0.3 * (1 - radius**2)], axis=-1)
+    poisson, alpha = (scene["poisson"],) * 2, (scene["alpha"],) * 2
+    loads, phases = np.append(np.zeros(11), share), 0.5 - 0.5 * np.cos(0.2 * np.pi * np.arange(12))
+    phases[-1], sizes = 1.0, []
+    for rise in (0.0, 1.0):
+        context = MethodContext(radius < 1, scale, 4.0, "stripped", poisson, living=True, alpha=alpha)
+        method, confidence = physics.Physics(), np.ones(x.shape, np.float32)
+        for second, (load, phase) in enumerate(zip(loads, phases, strict=True)):
+            moved = (load * displacement + rise * phase * own_motion).astype(np.float32)
+            motion = Motion3D(moved, np.full(moved.shape, 0.01, np.float32))
+            frame = FrameMotion(moved[..., :2] / scale, confidence, motion=motion, time_s=float(second))
+            method(frame, context, False)
+        sizes.append(method.revise(loads == 0)[-1].size_mn)
+    assert sizes[1] == pytest.approx(sizes[0], rel=error)
