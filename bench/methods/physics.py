@@ -333,16 +333,24 @@ def find_gains(scene: MethodContext, weights: TissueWeights, large: Sequence[Lar
         size = float(np.linalg.norm(linear.force.mean))
         if size == 0:
             continue
-        ends, motion = PHYSICS.unsolved, take_off_own_motion(frame, weights.own_mm, linear.own)
+        ends, moved = PHYSICS.unsolved, [take_off_own_motion(frame, weights.own_mm, linear.own)]
+        if weights.assumed:  # or the tissue is still, and what the inverse took for its motion is the load's
+            moved.append(frame.motion)
         try:
-            forces = [
-                large_motion.reaction(motion, tissue, opening_mm, alpha) for alpha in sorted(set(scene.alpha))
-            ]
-            sizes = [float(np.linalg.norm(force)) / size for force in forces]
+            sizes = np.array(
+                [
+                    [
+                        np.linalg.norm(large_motion.reaction(motion, tissue, opening_mm, alpha)) / size
+                        for alpha in sorted(set(scene.alpha))
+                    ]
+                    for motion in moved
+                ]
+            )
         except ExcessiveLoad:
-            sizes = [np.inf]
-        if max(sizes) <= min(PHYSICS.most_gain, PHYSICS.most_ratio * min(sizes)):
-            ends = min(sizes), max(sizes)
+            sizes = np.full((1, 1), np.inf)
+        least, most = sizes.min(axis=1), sizes.max(axis=1)
+        if (most <= np.minimum(PHYSICS.most_gain, PHYSICS.most_ratio * least)).all():
+            ends = float(least.min()), float(most.max())
         else:
             unsolved += 1
         rows.append((size, *ends))

@@ -55,8 +55,9 @@ class ModelConstants:
     around_mm: float = 1.5  # range of "local": with each point alone coverage is 80%, not 90% (design.md)
     unmet: float = 2.0  # inflates the tissue's own motion: short spans miss parts of a cycle (science.md)
     independent: float = 0.003
-    """Share of the covariance of the tissue's own motion without correlations. With a tenth its modes fit the
-    far field of a press: on pulsating tissue forces were too small by 30%, now by 22 (still: by 19)."""
+    """Share of the covariance of the tissue's own motion without correlations. Modes of a tenth fit the far
+    field of a press: on 10 sequences of `mission-ood` with a drawn pulse added, 15 s of it without contact,
+    strong forces were too small by 30%, with this by 22, without a pulse by 19."""
     least_mm: float = 0.005  # lower limit of flow's deviation
     draws: int = 128  # of hypotheses in a posterior
 

@@ -1,1 +1,1 @@
-"""The guard: twelve short probes of the product, and by how much each has moved since a result was stored."""
+"""The guard: short probes of the product, and by how much each has moved since a result was stored."""

@@ -3,7 +3,8 @@
 Force is estimated from every sequence's stored motion as from a recording's, monocular and in stereo, with
 the membrane unknown, stated, and stated with its stiffness. The constants of `bench.methods.force_fusion`
 were set on sequences with even numbers; odd ones are reported. Those of physics' membranes were set on 42
-covered sequences, 5 of which are among them. On pulsating tissue physics alone is measured, on all sequences.
+covered sequences, 5 of which are among them. On pulsating tissue physics alone is measured, on all sequences:
+its constants of a pulse were set on others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,13 +31,14 @@ from synth.dataset.store import Sequence as Stored
 from synth.flow.stereo.stereo_track import Motion3D
 from synth.job.types import MembraneState
 
-Case = dict[str, Any]  # input of the methods: `cameras`, and what is stated, one of `_STATED`
+Case = dict[str, Any]  # input of the methods: `cameras`, and what is `stated`
 _USUAL, _CLINICAL, _PULSATING = "as mission", "clinical", "pulsating"
 _STATED = "nothing", "membrane", "membrane and its stiffness"
 _WITH_RELAXATION = f"{_STATED[-1]}, relaxation"
-_LIVING = "nothing, and it may pulsate"  # with the others it is stated that nothing does
+_LIVING = "nothing, and it may pulsate"
 _LIVING_STATED = "membrane, and it may pulsate"
-_SPAN = "membrane, and spans without contact"  # of pulsating tissue
+_SPAN = "membrane, and spans without contact"
+_MAY_PULSATE = _LIVING, _LIVING_STATED, _SPAN  # with the others it is stated that nothing does
 _MEASURED = 1.25  # factor of the true stiffness, up and down, that is stated
 _CONTROL = "control: another video's force"
 _FREE = 1e-3  # of the sequence's largest force: below it a frame is without contact
@@ -54,7 +56,7 @@ def measure(
 
     `clinical`: a dataset with two cameras of the job `clinical`, scored in the same way, if given;
     `pulsating`: one of tissue with a pulse, of which physics is scored; `work`: folder of estimates, which a
-    later run reuses; `every`: 1 for odd numbers, 0 for even ones.
+    later run reuses; `every`: 1 for odd numbers, 0 for even ones, but of `pulsating`.
     """
     given = {_USUAL: data, _CLINICAL: clinical, _PULSATING: pulsating}
     roots = {loads: root for loads, root in given.items() if root is not None}
@@ -69,7 +71,7 @@ def _score(loads: str, data: Path, work: Path, every: int) -> list[dict[str, Any
     rows = []
     relaxation, pulsates = read_relaxation(Dataset(data).paths[0]), loads == _PULSATING
     cases = (_LIVING, _LIVING_STATED, *_STATED, *[_WITH_RELAXATION] * bool(relaxation))
-    for cameras, stated in product((1, 2), (_LIVING, _LIVING_STATED, _SPAN) if pulsates else cases):
+    for cameras, stated in product((1, 2), _MAY_PULSATE if pulsates else cases):
         # None is shipped for one camera.
         model = Model(load_model(NAMES[0])) if cameras == 2 and not pulsates else None
         case: Case = {"cameras": cameras, "stated": stated}
@@ -105,7 +107,7 @@ def _estimate(sequence: Stored, case: Case, model: Model | None) -> dict[str, An
         sequence.attrs["scale_mm_per_px"],
         sequence.attrs["young_kpa"],
         "unknown" if case["stated"] in (_LIVING, "nothing") else membrane,
-        living=case["stated"] in (_LIVING, _LIVING_STATED, _SPAN),
+        living=case["stated"] in _MAY_PULSATE,
         membrane_mn_per_mm=(stiffness / _MEASURED, stiffness * _MEASURED)
         if stiffness and case["stated"] in (_STATED[-1], _WITH_RELAXATION)
         else None,
@@ -207,7 +209,8 @@ def page(data: Mapping[str, Any]) -> report.Page:
         pulsating_words = (
             "By the dataset `pulsating` of `evidence/all.py`: 16 gestures of `mission` by one instrument in "
             "27 s, on tissue that rises with the heart by 0.1 to 0.5 mm and breathing by 0.1 to 1 mm, at "
-            "1.5 frames a second. Spans without contact are those of no force: some seven seconds in all.",
+            "1.5 frames a second. Spans without contact are those of no force: some seven seconds in all. "
+            "Nothing is subtracted first, as `bench score` does with rhythms that it finds.",
         )
         sections.append(report.Section("Tissue that pulsates", pulsating_rows, pulsating_words))
     return report.Page("Physics, network, and their fusion", data, words, sections)
