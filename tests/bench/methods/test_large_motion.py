@@ -8,9 +8,10 @@ from dome import patch
 from driven_gesture import gesture
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from bench.methods import large_motion, physics
+from bench.methods import large_motion, physics, posterior
 from bench.methods.compliance import DOME_MM, TissueKind
 from bench.methods.method_interface import FrameMotion, MethodContext
+from bench.methods.tissue_weights import TissueWeights, infer
 from evidence.fem.solvers import FELUPE, OPENING_MM, compare_estimate, motion_of
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
@@ -127,3 +128,49 @@ def test_the_tissues_own_motion_is_not_taken_for_force(number: int, share: float
             method(frame, context, False)
         sizes.append(method.revise(loads == 0)[-1].size_mn)
     assert sizes[1] == pytest.approx(sizes[0], rel=error)
+
+
+def test_own_motion_is_taken_off_about_the_middle_of_the_loads() -> None:
+    rng, middle_mm = np.random.default_rng(3), np.array([5.0, -3.0])
+    points, modes = rng.uniform(-12, 12, (40, 2)), rng.normal(scale=0.1, size=(3, 6, 2))
+    own_mm = posterior.polynomials(points - middle_mm) @ (modes @ [0.5, -0.3]).T
+    motion = large_motion.SeenMotion(points, own_mm + 1.0, np.ones(40), 1.0, 0.2)
+    observation = posterior.Observation(np.zeros((3, 9)), np.ones((3, 9)))
+    frame = physics.LargeFrame(observation, motion, middle_mm)
+    rest = physics.take_off_own_motion(frame, modes, np.array([0.5, -0.3]))
+    np.testing.assert_allclose(rest.moved, 1.0)
+    none = physics.take_off_own_motion(frame, modes[..., :0], np.zeros(0))
+    np.testing.assert_array_equal(none.moved, motion.moved)
+    more, most = (physics.take_off_own_motion(frame, modes, np.array([a, -a])) for a in (0.8, 9.0))
+    np.testing.assert_array_equal(more.moved, most.moved)
+
+
+@pytest.mark.slow
+def test_where_own_motion_is_only_bounded_the_gain_holds_still_tissue() -> None:
+    scene, grid = SCENES[0], physics.GRID
+    axis = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
+    x, y = np.meshgrid(axis, axis)
+    moved = 0.4 * np.moveaxis(motion_of(scene, x, y)[0], -1, 0)
+    inside, deviation = np.hypot(x, y) < OPENING_MM, np.full(moved.shape, 0.01)
+    motion = large_motion.measure_motion(moved, deviation, inside, grid)
+    frame = physics.LargeFrame(physics.observe(moved, deviation, inside), motion, np.zeros(2))
+    tissue, modes = TissueKind("bonded", 0.0, scene["poisson"]), np.zeros((3, 6, 1))
+    modes[2, 0], modes[2, 3], modes[2, 5] = 0.3, -0.3, -0.3  # the middle rises and sinks
+    context = MethodContext(
+        inside, grid.pitch_mm, 4.0, "stripped", (scene["poisson"],) * 2, alpha=(scene["alpha"],) * 2
+    )
+    ends = {}
+    for name, own_mm, assumed in (
+        ("still", modes[..., :0], False),
+        ("seen", modes, False),
+        ("bounded", modes, True),
+    ):
+        weights = TissueWeights((tissue,), np.ones(1), own_mm, assumed)
+        gains, size = (
+            physics.find_gains(context, weights, [frame]),
+            infer(weights, frame.observation).force.mean,
+        )
+        ends[name] = np.linalg.norm(size) * np.array([gains.low[-1], gains.high[-1]])
+    assert np.ptp(ends["still"]) == np.ptp(ends["seen"]) == 0
+    np.testing.assert_allclose(ends["bounded"], np.sort([ends["seen"][0], ends["still"][0]]), rtol=1e-4)
+    assert np.ptp(ends["bounded"]) > 0.05 * ends["still"][0]
