@@ -79,20 +79,21 @@ class LoadWindow:
         on_grid = view.mean(moved), view.mean(deviation), view.mask
         places = find_places(*on_grid, view.grid, RULE.seen_mm + self._own_mm)
         moving = [place.point for place in places if place.motion_mm >= RULE.moving_mm + self._own_mm]
-        middle = place_window(moving, self._find_middle())
+        middle = place_window(moving, self.find_middle())
         self.offset = round(middle[0] / node_mm), round(middle[1] / node_mm)
         self._strongest_mm = max(self._strongest_mm, *(place.motion_mm for place in places), 0.0)
         self._notice(places)
 
     def _notice(self, places: Sequence[Place]) -> None:
         """Remembers places that a window did not reach in two frames in turn: in one, flow may be wrong."""
-        middle, before = self._find_middle(), self._beyond
+        middle, before = self.find_middle(), self._beyond
         self._beyond = [p for p in places if measure_distance(p.point, middle) > posterior.MODEL.reach_mm]
         for place in self._beyond:
             if any(measure_distance(place.point, other.point) < RULE.apart_mm for other in before):
                 self._missed.append((place.motion_mm, measure_distance(place.point, middle)))
 
-    def _find_middle(self) -> Point:
+    def find_middle(self) -> Point:
+        """The middle of the window."""
         return self.offset[0] * compliance.NODE_MM, self.offset[1] * compliance.NODE_MM
 
     def locate(self, offset: Offset) -> Point:

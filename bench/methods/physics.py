@@ -63,7 +63,7 @@ class PhysicsConstants:
     unsolved: tuple[float, float] = (0.8, 2.0)
     """Gains of the linear force that hold what it may be where motion is large and not solved: those of nine
     driven contacts of 75 to 260 mN were 0.93 to 1.6."""
-    own: float = 0.8
+    own_amplitude: float = 0.8
     """Largest amplitude of the tissue's own motion that is taken off large motion, in deviations of modes:
     the peak of a sinusoid from rest is 1.6 of its root mean square, which `MODEL.unmet` doubles. The linear
     inverse finds more, as its own motion takes up what loads don't explain."""
@@ -146,7 +146,7 @@ class Physics:
         if frame.trusted:
             middle_mm = np.zeros(2)
             if self._is_edge_seen and view is not self._view:  # an opening is about the tissue's middle
-                view, middle_mm = self._view, compliance.NODE_MM * np.array(self._window.offset)
+                view, middle_mm = self._view, np.array(self._window.find_middle())
                 moved, spread = (view.mean(field) for field in fields)
             surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
             least_slope = self._large[-1].motion.slope * PHYSICS.steeper if self._large else 0.0
@@ -333,7 +333,7 @@ def find_gains(scene: MethodContext, weights: TissueWeights, large: Sequence[Lar
         size = float(np.linalg.norm(linear.force.mean))
         if size == 0:
             continue
-        ends, moved = PHYSICS.unsolved, [take_off_own_motion(frame, weights.own_mm, linear.own)]
+        ends, moved = PHYSICS.unsolved, [take_off_own_motion(frame, weights.own_mm, linear.own_amplitudes)]
         if weights.assumed:  # or the tissue is still, and what the inverse took for its motion is the load's
             moved.append(frame.motion)
         try:
@@ -361,8 +361,8 @@ def find_gains(scene: MethodContext, weights: TissueWeights, large: Sequence[Lar
 def take_off_own_motion(frame: LargeFrame, own_mm: Floats, amplitudes: Floats) -> SeenMotion:
     """What loads move: no force at the surface causes the tissue's own motion, `own_mm` (C, 6, M) by its
     amplitudes (M,)."""
-    own = own_mm @ amplitudes.clip(-PHYSICS.own, PHYSICS.own)
-    moved_mm = posterior.polynomials(frame.motion.points - frame.middle_mm) @ own.T
+    coefficients = own_mm @ amplitudes.clip(-PHYSICS.own_amplitude, PHYSICS.own_amplitude)
+    moved_mm = posterior.polynomials(frame.motion.points - frame.middle_mm) @ coefficients.T
     return replace(frame.motion, moved=frame.motion.moved - moved_mm)
 
 

@@ -108,7 +108,7 @@ class Posterior:
     evidence: float  # logarithm of the marginal likelihood
     force: ForceMixture  # over E [mN/kPa]
     load: Floats  # (K, 3) mean load at the nodes
-    own: Floats  # (M,) mean amplitudes of the modes of the tissue's own motion
+    own_amplitudes: Floats  # (M,) mean amplitudes of the modes of the tissue's own motion
 
 
 @lru_cache(maxsize=32)

@@ -212,14 +212,11 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     return Posterior(
         float(weight @ [answer.evidence for answer in posteriors]),
         mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
-        _mean(weight, [answer.load for answer in posteriors]),
-        _mean(weights.weight, [answer.own for answer in posteriors[: len(weights.tissues)]]),
+        np.tensordot(weight, [answer.load for answer in posteriors], axes=1),
+        np.tensordot(
+            weights.weight, [answer.own_amplitudes for answer in posteriors[: len(weights.tissues)]], axes=1
+        ),
     )
-
-
-def _mean(weight: Floats, values: Sequence[Floats]) -> Floats:
-    """Mean of arrays of equal shape, weights of sum 1."""
-    return np.asarray(np.tensordot(weight, np.stack(values), axes=1))
 
 
 def describe(weights: TissueWeights, scene: MethodContext) -> str:

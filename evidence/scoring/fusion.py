@@ -114,8 +114,9 @@ def _estimate(sequence: Stored, case: Case, model: Model | None) -> dict[str, An
         relaxation=case.get("relaxation", ()),
     )
     physics, fusion, times = Physics(), Fusion(MAIN, PHYSICS), sequence["time"][:].tolist()
+    true_force = sequence["force"][:]
     frames: list[dict[str, ForceEstimate]] = []
-    for k in range(len(sequence["force"])):
+    for k in range(len(true_force)):
         flow, confidence = sequence["flow_recovered"][k], sequence["flow_confidence"][k].astype(np.float32)
         estimates: dict[str, ForceEstimate] = {}
         motion = None
@@ -127,7 +128,7 @@ def _estimate(sequence: Stored, case: Case, model: Model | None) -> dict[str, An
             FrameMotion(flow, confidence, motion=motion, time_s=times[k]), scene, False
         )
         frames.append(estimates)
-    size = np.linalg.norm(sequence["force"][:], axis=1)
+    size = np.linalg.norm(true_force, axis=1)
     contact_free = (size < _FREE * size.max()) & (case["stated"] == _SPAN)
     for estimates, revision in zip(frames, physics.revise(contact_free), strict=True):
         estimates[PHYSICS] = revision
@@ -138,7 +139,7 @@ def _estimate(sequence: Stored, case: Case, model: Model | None) -> dict[str, An
         name: [[*frame[name].force_mn.tolist(), frame[name].low_mn, frame[name].high_mn] for frame in frames]
         for name in _names(model)
     }
-    return {"membrane": membrane, "true": sequence["force"][:].tolist(), "estimated": rows}
+    return {"membrane": membrane, "true": true_force.tolist(), "estimated": rows}
 
 
 def _row(tissue: str, name: str, estimates: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -168,7 +169,7 @@ def page(data: Mapping[str, Any]) -> report.Page:
             "membrane": row["tissue"],
             "method": row["method"],
             **_cells(row),
-            "coverage": row["coverage"] and report.mean_cell(row["coverage"], ".0%"),
+            "coverage": _coverage_cell(row),
         }
         for row in unknown
     ]
@@ -220,7 +221,7 @@ def _tabulate_pulsating(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
     """Physics' rows of all tissue, and of another video's force."""
     return [
         {"cameras": row["cameras"], "stated": row["stated"], "method": row["method"], **_cells(row)}
-        | {"coverage": row["coverage"] and report.mean_cell(row["coverage"], ".0%")}
+        | {"coverage": _coverage_cell(row)}
         for row in rows
         if row["tissue"] == "all"
     ]
@@ -249,6 +250,10 @@ def _cells(row: Mapping[str, Any]) -> dict[str, str]:
         "force": report.mean_cell(row["whole"], ".0%"),
         "bias of strong presses": report.mean_cell(row["bias"], ".0%"),
     }
+
+
+def _coverage_cell(row: Mapping[str, Any]) -> str | None:
+    return row["coverage"] and report.mean_cell(row["coverage"], ".0%")
 
 
 STUDY = Study(
