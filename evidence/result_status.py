@@ -38,17 +38,21 @@ class Status:
     """The probes whose sketches it holds; empty: none are known."""
     moved: tuple[Change, ...]
     """Those that have moved since."""
+    missing: tuple[str, ...]
+    """Probes that its study needs today, and whose sketches it does not hold."""
 
     @property
     def stands(self) -> bool:
         """Whether it is what a run of today would measure, within the probes' tolerances."""
-        return bool(self.needs) and not self.moved
+        return bool(self.needs) and not self.moved and not self.missing
 
     def describe(self) -> str:
         """`stands`, `out of date, ...: flow 0.8% (confidence)` or `old`, and `times of DATE`."""
         state = "stands" if self.stands else "old: made before the guard, or without probes"
-        if self.moved:
-            state = "out of date, as these have changed: " + ", ".join(change.text() for change in self.moved)
+        if self.needs and not self.stands:
+            changes = [change.text() for change in self.moved]
+            changes += [f"{name} (a newer probe)" for name in self.missing]
+            state = "out of date, as these have changed: " + ", ".join(changes)
         return f"{state}; times are of {self.date or 'an unknown date'}" if self.timed else state
 
     def row(self) -> dict[str, Any]:
@@ -65,9 +69,13 @@ class Status:
 
 def gather(results: Path = RESULTS, today: Sketches | None = None) -> list[Status]:
     """Status of every JSON file of a folder but the guard, by name; `today`: sketches to compare with."""
+    from evidence import study  # which stamps its results by this module
+
     today = guard.read_sketches() if today is None else today
     files = sorted(path for path in results.rglob("*.json") if path.name != guard.FILE.name)
-    return [_read(file, today) for file in files]
+    studies = [entry for entry in map(study.load, study.names()) if entry.result]
+    needs = {file: entry.needs for entry in studies for file in files if file.match(entry.result)}
+    return [_read(file, today, needs.get(file, ())) for file in files]
 
 
 def stamp(needs: Iterable[str], timed: bool = False) -> dict[str, Any]:
@@ -113,7 +121,8 @@ def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
     }
 
 
-def _read(file: Path, today: Mapping[str, Any]) -> Status:
+def _read(file: Path, today: Mapping[str, Any], study_needs: Sequence[str]) -> Status:
+    """Status of a file; `study_needs`: probes that the study of this result needs today."""
     stored = json.loads(file.read_text("utf-8"))
     stored = stored if isinstance(stored, dict) else {}
     before: Sketches = stored.get("needs", {})
@@ -128,4 +137,5 @@ def _read(file: Path, today: Mapping[str, Any]) -> Status:
         timed=bool(stored.get("timed")),
         needs=needs,
         moved=changes,
+        missing=tuple(name for name in study_needs if name not in before),
     )

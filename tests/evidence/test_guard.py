@@ -177,6 +177,20 @@ def test_a_result_says_what_has_moved_since(tmp_path: Path) -> None:
             assert text == f"# Title\n\n*State: {state.describe()}.*\n\nText.\n"
 
 
+def test_a_result_from_before_a_probe_of_its_study_does_not_stand(tmp_path: Path) -> None:
+    entry = study.load("fem.loads")
+    file = tmp_path / entry.result
+    file.parent.mkdir(parents=True)
+    complete = result_status.stamp(entry.needs)
+    file.write_text(json.dumps(complete))
+    (state,) = result_status.gather(tmp_path)
+    assert (state.stands, state.missing) == (True, ())
+    del complete["needs"][entry.needs[-1]]
+    file.write_text(json.dumps(complete))
+    (state,) = result_status.gather(tmp_path)
+    assert (state.stands, state.missing) == (False, entry.needs[-1:])
+
+
 def test_pages_state_whether_their_results_stand(tmp_path: Path) -> None:
     for state in result_status.gather():
         page = state.file.with_name("README.md")
