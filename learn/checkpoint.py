@@ -231,8 +231,18 @@ def disk_needed(folder: Path, settings: TrainingSettings) -> int:
 
 def _shapes(settings: TrainingSettings) -> dict[str, tuple[int, ...]]:
     import torch
+    from torch.overrides import TorchFunctionMode
 
-    with torch.device("meta"):  # without memory
+    class WithoutInitialisation(TorchFunctionMode):
+        """Random numbers for tensors without memory would import torch's compiler, for seconds."""
+
+        def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            kwargs, draws = kwargs or {}, (torch.Tensor.normal_, torch.Tensor.uniform_)
+            if func in draws or getattr(func, "__module__", "") == "torch.nn.init":
+                return args[0] if args else kwargs["tensor"]
+            return func(*args, **kwargs)
+
+    with torch.device("meta"), WithoutInitialisation():
         state = build(settings.network, settings.arch).state_dict()
     return {name: tuple(value.shape) for name, value in state.items()}
 

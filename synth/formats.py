@@ -11,7 +11,7 @@ STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 MOTION = 8
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
-MESH, CONTENT, COMPLIANCE, CLIPS, TRAINING, SCORING = 1, 9, 1, 1, 2, 9
+MESH, CONTENT, COMPLIANCE, CLIPS, TRAINING, SCORING = 1, 9, 1, 1, 2, 10
 """Of computed values, on which caches and datasets depend next to their inputs: the volume mesh; what a job
 renders (mechanics, pictures, labels); the matrices of physics; packed clips; what a training returns; what
 `bench score` returns. Each is raised with a change that moves its probe of the guard (`make guard`)."""

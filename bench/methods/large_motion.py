@@ -8,7 +8,8 @@ point of the surface to the place d_p where it was seen,
 W the energy of a block under Ogden's law, k_p less where the motion is less certain; the springs' ends are
 then moved on by what tissue lags. The pull of those at the contact, where tissue moves by a quarter of the
 largest motion, is the force: neither its place nor its form has to be found, and where the tissue's edge is
-seen, what holds it hardly matters.
+seen, what holds it hardly matters. Places that move apart from those within reach of the loads don't count:
+the linear inverse, whose gain is sought, doesn't see them, and at the picture's border motion is often wrong.
 
 Where it is not seen, it lies between what is seen and far away. An opening that is too small resists the
 motion at the picture's border, one that is too wide lets go of it: springs beside the contact then pull with
@@ -23,11 +24,11 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, label
 
-from bench.methods.compliance import DOME_MM, TO_CAMERA, TissueKind
+from bench.methods.compliance import DOME_MM, OPENING_MM, TO_CAMERA, TissueKind
 from learn.data.grid import Grid
-from synth.arrays import Floats, Map
+from synth.arrays import Floats, Map, Mask
 from synth.fem import surface_embedding
 from synth.fem.driven_contact import Balance
 from synth.fem.equilibrium import ExcessiveLoad
@@ -62,13 +63,17 @@ class SeenMotion:
     moved: Floats  # (P, C) mm, camera axes
     firmness: Floats  # (P,) 0..1, of a point's spring over that of the surest point
     area_mm2: float  # of a point
-    slope: float  # largest slope, mm per mm
+    slope: float  # largest slope within reach, mm per mm
+    is_near: Mask  # (P,) within reach of the loads
 
 
-def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion:
+def measure_motion(
+    moved: Map, deviation: Map, mask: Map, grid: Grid, middle_mm: Floats | None = None
+) -> SeenMotion:
     """Motion on a grid, by means over neighbours that are weighted by its precision.
 
-    `moved`, `deviation`: (C, N, N) mm; `mask`: (N, N) above 0.5 where there is tissue.
+    `moved`, `deviation`: (C, N, N) mm; `mask`: (N, N) above 0.5 where there is tissue; `middle_mm`: (2,) of
+    the loads from the middle of the grid, camera x and y.
     """
     inside = mask > 0.5
     weight = inside / (np.square(deviation, dtype=np.float64) + _LEAST_MM**2)
@@ -80,16 +85,17 @@ def measure_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMot
         return np.asarray(np.stack(mean) / np.maximum(total, 1e-12))
 
     least_mm, most_mm = _SMOOTH_MM
+    rows, columns = np.nonzero(inside)
+    places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
+    points = np.asarray(places * grid.pitch_mm, np.float64)
+    is_near = np.linalg.norm(points - (0.0 if middle_mm is None else middle_mm), axis=1) <= OPENING_MM
     slopes = np.array(np.gradient(smooth(most_mm), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
-    slope = np.linalg.norm(slopes, axis=(0, 1))[inside].max(initial=0.0)
+    slope = np.linalg.norm(slopes, axis=(0, 1))[inside][is_near].max(initial=0.0)
     spread = deviation[:, inside].max(axis=0)
     mean = smooth(min(max(_PER_MM * float(np.median(spread)), least_mm), most_mm))
     firmness = 1 / (1 + np.square(spread / _SURE_MM, dtype=np.float64))
     firmness /= firmness.max(initial=1e-9)
-    rows, columns = np.nonzero(inside)
-    places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
-    points = np.asarray(places * grid.pitch_mm, np.float64)
-    return SeenMotion(points, mean[:, inside].T, firmness, grid.pitch_mm**2, float(slope))
+    return SeenMotion(points, mean[:, inside].T, firmness, grid.pitch_mm**2, float(slope), is_near)
 
 
 def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float | None, alpha: float) -> Floats:
@@ -123,7 +129,7 @@ def _pull(
     volume, embedding = _block(tissue.edge == "slipping", *radii, len(motion.points), motion.points.tobytes())
     sheet = MembraneSheet(tissue.membrane, max(tissue.stretch, _LEAST_STRETCH)) if tissue.membrane else None
     system = assemble(volume, "ogden", tissue.poisson, sheet, alpha)
-    value, size = embedding.value, np.linalg.norm(motion.moved, axis=1)
+    value = embedding.value
     stiffness = _FIRM_PER_MM * motion.area_mm2 * motion.firmness[:, None]
     nodal = value.T @ sp.diags_array(stiffness[:, 0]) @ value
     balance = Balance(system, sp.csr_array(sp.kron(nodal, np.eye(3), format="csr")))
@@ -144,8 +150,21 @@ def _pull(
     for _ in range(_REFINEMENTS):  # the springs' ends are moved on by as much as the tissue lags
         targets = targets + observed - value @ u
         u, _, energy, _ = balance.find(value.T @ (stiffness * targets), u, u, energy, _LEAST_JACOBIAN)
-    traction, contact = stiffness * (targets - value @ u), size >= _MOVED * size.max()
-    return TO_CAMERA @ traction[contact].sum(axis=0), TO_CAMERA @ traction[~contact].sum(axis=0)
+    traction, (contact, beside) = stiffness * (targets - value @ u), _find_contact(motion)
+    return TO_CAMERA @ traction[contact].sum(axis=0), TO_CAMERA @ traction[beside].sum(axis=0)
+
+
+def _find_contact(motion: SeenMotion) -> tuple[Mask, Mask]:
+    """Which points (P,) move with the contact, and which lie beside it."""
+    size = np.linalg.norm(motion.moved, axis=1)
+    moving = size >= _MOVED * size[motion.is_near].max(initial=0.0)
+    column, row = (
+        np.rint((motion.points - motion.points.min(axis=0)) / np.sqrt(motion.area_mm2)).astype(int).T
+    )
+    image = np.zeros((row.max() + 1, column.max() + 1), bool)
+    image[row, column] = moving
+    place = label(image, np.ones((3, 3)))[0][row, column]
+    return moving & np.isin(place, place[moving & motion.is_near]), ~moving
 
 
 _LEAST_STRETCH = 1.001  # of a membrane at rest: a slack one has no stiffness across

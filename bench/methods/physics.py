@@ -148,7 +148,7 @@ class Physics:
             if self._is_edge_seen and view is not self._view:  # an opening is about the tissue's middle
                 view, middle_mm = self._view, np.array(self._window.find_middle())
                 moved, spread = (view.mean(field) for field in fields)
-            surface = large_motion.measure_motion(moved, spread, view.mask, GRID)
+            surface = large_motion.measure_motion(moved, spread, view.mask, GRID, middle_mm)
             least_slope = self._large[-1].motion.slope * PHYSICS.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP[len(moved)], least_slope):
                 self._large.append(LargeFrame(observation, surface, middle_mm))
@@ -337,15 +337,17 @@ def find_gains(scene: MethodContext, weights: TissueWeights, large: Sequence[Lar
         if weights.assumed:  # or the tissue is still, and what the inverse took for its motion is the load's
             moved.append(frame.motion)
         try:
-            sizes = np.array(
+            forces = np.array(
                 [
                     [
-                        np.linalg.norm(large_motion.reaction(motion, tissue, opening_mm, alpha)) / size
+                        large_motion.reaction(motion, tissue, opening_mm, alpha)
                         for alpha in sorted(set(scene.alpha))
                     ]
                     for motion in moved
                 ]
             )
+            sizes = np.linalg.norm(forces, axis=2) / size
+            sizes[forces @ linear.force.mean <= 0] = np.inf  # the motion is wrong, or of several contacts
         except ExcessiveLoad:
             sizes = np.full((1, 1), np.inf)
         least, most = sizes.min(axis=1), sizes.max(axis=1)

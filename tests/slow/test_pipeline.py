@@ -12,6 +12,8 @@ import pytest
 
 from synth.checks import verify
 from synth.dataset.store import Dataset
+from synth.engine.run import render_job
+from synth.job.reader import load_job
 
 JOB = """
 seed: 5
@@ -39,7 +41,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pipeline")
     job, out = folder / "job.yaml", folder / "out"
     job.write_text(JOB)
-    finish(start(job, out))
+    assert not render_job(load_job(job), out, workers=1).failed
     return out
 
 

@@ -64,9 +64,15 @@ def test_the_force_is_found_where_the_picture_cuts_a_wide_opening(opening_mm: fl
     interpolate = CloughTocher2DInterpolator(surface.vertices[:, :2], motion.displacement[1])
     displacement = np.moveaxis(interpolate(np.stack([x, -y], axis=-1)) * [1, -1, -1], -1, 0)
     in_view = (np.maximum(np.abs(x), np.abs(y)) < 13) & (np.hypot(x, y) < opening_mm)
-    observation = large_motion.measure_motion(displacement, np.full(displacement.shape, 0.01), in_view, grid)
-    answer = large_motion.reaction(observation, TissueKind("bonded", 0.0, 0.45), None, -8.0)
+    deviation, bare = np.full(displacement.shape, 0.01), TissueKind("bonded", 0.0, 0.45)
+    observation = large_motion.measure_motion(displacement, deviation, in_view, grid)
+    answer = large_motion.reaction(observation, bare, None, -8.0)
     assert np.linalg.norm(answer - force) <= 0.1 * np.linalg.norm(force)
+    displacement[2, (x < -10) & (y > 10)] += 1.0  # as under a shaft
+    mistaken = large_motion.measure_motion(displacement, deviation, in_view, grid)
+    assert mistaken.slope == pytest.approx(observation.slope, rel=0.01)
+    other_answer = large_motion.reaction(mistaken, bare, None, -8.0)
+    assert np.linalg.norm(other_answer - force) <= 0.15 * np.linalg.norm(force)
 
 
 @pytest.mark.slow
@@ -134,7 +140,7 @@ def test_own_motion_is_taken_off_about_the_middle_of_the_loads() -> None:
     rng, middle_mm = np.random.default_rng(3), np.array([5.0, -3.0])
     points, modes = rng.uniform(-12, 12, (40, 2)), rng.normal(scale=0.1, size=(3, 6, 2))
     own_mm = posterior.polynomials(points - middle_mm) @ (modes @ [0.5, -0.3]).T
-    motion = large_motion.SeenMotion(points, own_mm + 1.0, np.ones(40), 1.0, 0.2)
+    motion = large_motion.SeenMotion(points, own_mm + 1.0, np.ones(40), 1.0, 0.2, np.ones(40, bool))
     observation = posterior.Observation(np.zeros((3, 9)), np.ones((3, 9)))
     frame = physics.LargeFrame(observation, motion, middle_mm)
     rest = physics.take_off_own_motion(frame, modes, np.array([0.5, -0.3]))

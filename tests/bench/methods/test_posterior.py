@@ -136,8 +136,8 @@ def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
 
 @pytest.mark.slow
 def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: LoadBasis) -> None:
-    side = 80
-    scene = MethodContext(np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, 2.0)
+    edge_seen = np.pad(np.ones((80, 80), bool), 20)
+    scene = MethodContext(edge_seen, 12 * np.sqrt(np.pi) / 80, 2.0, poisson=(0.45, 0.45))
     stiff = []
     for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
         frames = [observe(press(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]

@@ -251,7 +251,7 @@ def test_it_is_drawn_and_shades_where_it_touches(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_parts_and_workers_draw_it(tmp_path: Path) -> None:
     make_rod().export(tmp_path / "rod.stl")
-    job = make_job(tmp_path / "rod.stl").model_copy(update={"sequences": 2})
+    job = make_job(tmp_path / "rod.stl").model_copy(update={"sequences": 2, "frames": 3})
     whole = render_job(job, tmp_path / "whole", workers=1)
     parts = [render_job(job, tmp_path / "parts", workers=1, part=dataset_folder.Part(k, 2)) for k in (1, 2)]
     assert not whole.failed
