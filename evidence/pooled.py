@@ -11,7 +11,7 @@ from bench.methods.comparison import PHYSICS
 from bench.recording import recording_writer
 from bench.recording.meta import read_meta
 from bench.scoring import pool
-from evidence import report
+from evidence import report, result_cache
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -35,18 +35,20 @@ def copy_left(stereo: Path, mono: Path) -> None:
 
 
 def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
-    """Scores each recording in FOLDER-score next to it, unless it has been, and writes the page into `out`.
+    """Scores each recording in FOLDER-score next to it, unless this code has, and writes the page into `out`.
 
     Raises UserError: a command failed, or no recording has valid numbers.
     """
     options = _OPTIONS[cameras]
     scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
     for folder, score in zip(recordings, scores, strict=True):
-        if not (score / "score.json").is_file():
+        key, key_file = result_cache.key(*options), score / "code.key"
+        if not key_file.is_file() or key_file.read_text("utf-8") != key:
             words = ("score", str(folder), *options, "-o", str(score))
             code = subprocess.run([sys.executable, "-m", "bench", *words]).returncode
             if code not in (0, _REFUSED):
                 raise UserError(f"bench score: exit code {code}")
+            checked_file.write_whole(key_file, key)
     line = shlex.join(["bench", "score", "RECORDING", *options])
     provenance = f"{report.command()}\n    {line}\n    bench pool SCORES"
     pool.write(pool.pool(pool.read(scores)), out, provenance)

@@ -33,6 +33,8 @@ NEUTRAL = (
     "synth/fit",
 )
 """Packages that pass values on, or whose values no study stores."""
+LONG = "score", "score-stereo", "wide-tissue", "pulse"
+"""Probes of whole scores, of many tissues."""
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +120,7 @@ def test_comments_and_names_and_folders_are_not_seen(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.trial] * name.startswith("score")) for name in PROBES]
+    "name", [pytest.param(name, marks=[pytest.mark.trial] * (name in LONG)) for name in PROBES]
 )
 def test_a_probe_is_as_stored(name: str, request: pytest.FixtureRequest) -> None:
     """Or `make guard ACCEPT=1`, after its version was raised, says what this change moves."""

@@ -76,14 +76,14 @@ def test_the_force_is_found_where_the_picture_cuts_a_wide_opening(opening_mm: fl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES[::2], ids=lambda scene: f"{scene['alpha']:g}")
-@pytest.mark.parametrize(("cameras", "membrane"), [(1, "stripped"), (1, "intact"), (2, "stripped")])
+@pytest.mark.parametrize(
+    ("number", "cameras", "membrane"),
+    [(0, 1, "stripped"), (2, 1, "intact"), (0, 2, "stripped"), (2, 2, "stripped")],
+)
 def test_large_forces_are_estimated_or_said_to_be_out_of_range(
-    scene: dict,  # type: ignore[type-arg]
-    cameras: int,
-    membrane: Literal["stripped", "intact"],
+    number: int, cameras: int, membrane: Literal["stripped", "intact"]
 ) -> None:
-    side, young_kpa, scale = 120, 4.0, 0.22
+    scene, side, young_kpa, scale = SCENES[number], 120, 4.0, 0.22
     axis = (np.arange(side) - (side - 1) / 2) * scale
     x, y = np.meshgrid(axis, axis)
     displacement, force = motion_of(scene, x, y)

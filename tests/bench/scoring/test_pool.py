@@ -1,6 +1,7 @@
 """Pooled scores, and scores that can't be pooled."""
 
 import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ from command import run
 from bench.cli import app
 from bench.scoring import pool
 from bench.scoring.session_report import render_session, report_recordings
-from evidence.pooled import score_and_pool
+from evidence import pooled
+from synth import formats
 from synth.errors import UserError
 
 
@@ -72,12 +74,29 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
     out = tmp_path / "out"
     run(app, "pool", *folders, "-o", out)
     assert {path.name for path in out.iterdir()} == {"pool.json", "README.md"}
-    score_and_pool([tmp_path / name for name in "ab"], 1, tmp_path / "study")
-    assert json.loads((tmp_path / "study" / "pool.json").read_text())["recordings"] == ["a", "b"]
     with pytest.raises(UserError, match="given twice"):
         pool.read([folders[0], folders[0]])
     with pytest.raises(UserError, match="no readable score"):
         pool.read([tmp_path])
+
+
+def test_a_study_scores_recordings_once_for_each_version_of_the_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "ab":
+        store(tmp_path / f"{name}-score", score(name, 2.0, name))
+    scored = list[str]()
+
+    def run_command(words: list[str]) -> subprocess.CompletedProcess[str]:
+        scored.append(Path(words[4]).name)
+        return subprocess.CompletedProcess(words, 0)
+
+    monkeypatch.setattr(pooled.subprocess, "run", run_command)
+    for version in (1, 1, 2):
+        monkeypatch.setattr(formats, "SCORING", version)
+        pooled.score_and_pool([tmp_path / name for name in "ab"], 1, tmp_path / "study")
+    assert scored == ["a", "b", "a", "b"]
+    assert json.loads((tmp_path / "study" / "pool.json").read_text())["recordings"] == ["a", "b"]
 
 
 def test_one_page_of_several_recordings_links_each_and_says_why_one_is_missing() -> None:
