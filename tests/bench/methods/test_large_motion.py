@@ -1,12 +1,13 @@
 """Forces of tenths of a newton from exact motion: felupe's, and our own in wide openings."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from dome import patch
 from driven_gesture import gesture
+from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from bench.methods import large_motion, physics, posterior
@@ -154,20 +155,37 @@ def test_own_motion_is_taken_off_about_the_middle_of_the_loads() -> None:
     np.testing.assert_array_equal(more.moved, most.moved)
 
 
-@pytest.mark.slow
-def test_where_own_motion_is_only_bounded_the_gain_holds_still_tissue() -> None:
-    scene, grid = SCENES[0], physics.GRID
+def observe_scene(scene: dict[str, Any]) -> tuple[MethodContext, NDArray[Any], NDArray[Any]]:
+    """Of 0.4 of felupe's load on bare tissue: what is known, and motion and deviation (3, N, N) mm."""
+    grid = physics.GRID
     axis = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
     x, y = np.meshgrid(axis, axis)
     moved = 0.4 * np.moveaxis(motion_of(scene, x, y)[0], -1, 0)
-    inside, deviation = np.hypot(x, y) < OPENING_MM, np.full(moved.shape, 0.01)
-    motion = large_motion.measure_motion(moved, deviation, inside, grid)
-    frame = physics.LargeFrame(physics.observe(moved, deviation, inside), motion, np.zeros(2))
-    tissue, modes = TissueKind("bonded", 0.0, scene["poisson"]), np.zeros((3, 6, 1))
+    poisson, alpha = (scene["poisson"],) * 2, (scene["alpha"],) * 2
+    context = MethodContext(np.hypot(x, y) < OPENING_MM, grid.pitch_mm, 4.0, "stripped", poisson, alpha=alpha)
+    return context, moved, np.full(moved.shape, 0.01)
+
+
+@pytest.mark.slow
+def test_motion_that_opposes_the_linear_force_is_not_solved() -> None:
+    context, moved, deviation = observe_scene(SCENES[0])
+    tissue, no_motion = TissueKind("bonded", 0.0, context.poisson[0]), np.zeros((3, 6, 0))
+    weights = TissueWeights((tissue,), np.ones(1), no_motion, False)
+    observation = physics.observe(moved, deviation, context.tissue)
+    for sign in (1, -1):
+        motion = large_motion.measure_motion(sign * moved, deviation, context.tissue, physics.GRID)
+        gains = physics.find_gains(context, weights, [physics.LargeFrame(observation, motion, np.zeros(2))])
+        assert gains.unsolved == (sign < 0)
+        assert ((gains.low[-1], gains.high[-1]) == physics.PHYSICS.unsolved) == (sign < 0)
+
+
+@pytest.mark.slow
+def test_where_own_motion_is_only_bounded_the_gain_holds_still_tissue() -> None:
+    context, moved, deviation = observe_scene(SCENES[0])
+    motion = large_motion.measure_motion(moved, deviation, context.tissue, physics.GRID)
+    frame = physics.LargeFrame(physics.observe(moved, deviation, context.tissue), motion, np.zeros(2))
+    tissue, modes = TissueKind("bonded", 0.0, context.poisson[0]), np.zeros((3, 6, 1))
     modes[2, 0], modes[2, 3], modes[2, 5] = 0.3, -0.3, -0.3  # the middle rises and sinks
-    context = MethodContext(
-        inside, grid.pitch_mm, 4.0, "stripped", (scene["poisson"],) * 2, alpha=(scene["alpha"],) * 2
-    )
     ends = {}
     for name, own_mm, assumed in (
         ("still", modes[..., :0], False),
