@@ -17,6 +17,7 @@ _RATES_HZ = 0.5, 1000.0  # of frames whose times are in seconds
 _TRACKED_HZ = 10.0  # default rate of tracked frames
 _CAMERAS_HZ = 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 100.0, 120.0, 240.0  # usual rates
 _SAME_RATE, _TOGETHER_S, _LEAST_S = 2e-3, 0.2, 5.0  # of a rate; between starts; least record; by hand
+_LEFT_OUT = 0.25  # largest share of a calibration span that the search for the offset may leave out
 _COVERED = 0.9  # least share of the video that the sensor should cover
 _LEAST_PRESS = 5  # frames of a press that determine its gain
 
@@ -115,14 +116,19 @@ def _check_stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
 
 
 def check_margin(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
-    """Findings on samples that the search for the clocks' offset lacks."""
+    """Findings on samples that the search for the clocks' offset lacks.
+
+    Intervals that an offset within the search moves off the sensor's record are left out. Of a sensor that
+    starts with the video some always are.
+    """
     force, sync = recording.force, recording.meta.sync
     if force is None or sync.method != "correlate" or sync.calibration_s is None:
         return []
     (start, stop), t, margin = sync.calibration_s, sync.rate * force.time_s, sync.search_s
-    missing_s = max(t[0] - (start - margin), (stop + margin) - t[-1], 0.0)
+    missing_s = max(t[0] - (start - margin), 0.0) + max((stop + margin) - t[-1], 0.0)
     message = f"force.csv lacks {missing_s:.3g} s of sync.calibration_s and {margin:g} s on either side"
-    return [Finding("warning", "clocks", message)] if missing_s > 0 else []
+    is_much = missing_s > _LEFT_OUT * (stop - start)
+    return [Finding("warning", "clocks", message)] if is_much else []
 
 
 def _rising_times(tracked: TrackedRecording) -> Floats:

@@ -12,6 +12,7 @@ from bench.checks.check_recording import check_recording
 from bench.checks.files import check_tissue
 from bench.checks.judgement import SENSOR_CHECKS
 from bench.checks.sensor import SensorMotion, find_other_rest
+from bench.checks.times import check_margin
 from bench.cli import app
 from bench.recording.recording_folder import open_recording
 from bench.scoring.headline import headline
@@ -147,6 +148,17 @@ def test_a_video_that_starts_under_load_rests_elsewhere() -> None:
 
 
 BLACK = np.zeros((96, 128, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("span_s", "is_named"), [((0.0, 3.5), False), ((0.0, 1.0), True), ((3.0, 4.5), True)]
+)
+def test_a_sensor_that_starts_with_the_video_has_enough_samples_to_align_their_clocks(
+    make: Maker, span_s: tuple[float, float], is_named: bool
+) -> None:
+    sync = {"method": "correlate", "calibration_s": list(span_s), "search_s": 0.5}
+    recording = open_recording(make(frames=41, meta={"sync": sync}))
+    assert bool(check_margin(recording, TrackedRecording())) == is_named
 
 
 @pytest.mark.parametrize("picture", [BLACK + 3, BLACK + 128, texture(16, 16), texture(96, 128)])
