@@ -134,10 +134,10 @@ _PROTOCOL_HEAD = """\
 
 This protocol takes an afternoon. It leads to a recording from which force can be estimated and scored.
 `bench init --protocol RECORDING` writes the list at the end of this page into the recording's folder;
-`bench check RECORDING` says which steps a recording has, and what each missing one costs. The keys are those
-of [`meta.yaml`](../reference/recording.md). In surgery, without a sensor, what counts is: camera, second
-camera, scale, rest and outline; for stiffness and membrane state ranges ([which](../faq.md)). The list is
-written by `make docs` from `bench/checks/protocol.yaml`.
+`bench check RECORDING` says which of the ten steps that files show a recording has, and what each missing
+one costs. The keys are those of [`meta.yaml`](../reference/recording.md). In surgery, without a sensor, what
+counts is: camera, second camera, scale, rest and outline; for stiffness and membrane state ranges
+([which](../faq.md)). The list is written by `make docs` from `bench/checks/protocol.yaml`.
 
 ## Settings
 

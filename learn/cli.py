@@ -250,7 +250,7 @@ def predict_command(
         if not json:
             for note in file.notes:
                 _note(f"{file.name}: {note}")
-            _console.print(file.text)
+            _console.print(file.text, markup=False, highlight=False, soft_wrap=True)  # the path can be copied
     if json:
         print(json_.dumps(summarise(predictions, out)))
     if all(file.peak_mn is None for file in predictions):

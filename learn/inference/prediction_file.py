@@ -78,13 +78,19 @@ class PredictedFile(NamedTuple):
     name: str
     frames: int
     peak_mn: float | None  # None: no frame has a force
+    interval_mn: tuple[float, float]  # of 90%, of the peak; NaN: none
+    table: Path
     notes: list[str]
 
     @property
     def text(self) -> str:
         """One line for a terminal."""
-        outcome = "no frame has a force" if self.peak_mn is None else f"peak force {self.peak_mn:.3g} mN"
-        return f"{self.name}: {self.frames} frames, {outcome}"
+        low, high = self.interval_mn
+        interval = f" (90%: {low:.3g} to {high:.3g})" if np.isfinite([low, high]).all() else ""
+        outcome = (
+            "no frame has a force" if self.peak_mn is None else f"peak force {self.peak_mn:.3g} mN{interval}"
+        )
+        return f"{self.name}: {self.frames} frames, {outcome}; {self.table}"
 
 
 def summarise(files: Sequence[PredictedFile], out: Path) -> dict[str, Any]:
@@ -112,20 +118,28 @@ def predict_files(
         if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
             raise UserError(f"{file}: is the input and would be overwritten; choose another --out")
         prediction = estimate(motion)
-        write_prediction(prediction, stem)
+        table = write_prediction(prediction, stem)
         if overlay:
             write_overlay(prediction, source if is_single else source / f"{motion.name}.zarr", stem)
-        size = prediction["total_force_mn"][prediction["trusted"]]
-        peak = float(size.max()) if len(size) else None
-        yield PredictedFile(motion.name, len(prediction["trusted"]), peak, prediction["notes"].tolist())
+        count, trusted = len(prediction["trusted"]), np.flatnonzero(prediction["trusted"])
+        peak, interval, size = None, (np.nan, np.nan), prediction["total_force_mn"]
+        if len(trusted):
+            strongest = trusted[size[trusted].argmax()]
+            peak = float(size[strongest])
+            if all(end in prediction for end in _ENDS):
+                interval = float(prediction[_ENDS[0]][strongest]), float(prediction[_ENDS[1]][strongest])
+        yield PredictedFile(motion.name, count, peak, interval, table, prediction["notes"].tolist())
 
 
-def write_prediction(prediction: dict[str, Any], stem: Path) -> None:
-    """Writes `stem`.npz and `stem`.force.csv, each atomically, from the fields that `apply` returns."""
+def write_prediction(prediction: dict[str, Any], stem: Path) -> Path:
+    """Writes `stem`.npz and `stem`.force.csv, each atomically, from the fields that `apply` returns.
+
+    Returns the path of the table.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
-        np.savez_compressed(file, **{name: prediction[name] for name in FIELDS if name in prediction})
-    text = io.StringIO()
+    with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, **{name: prediction[name] for name in FIELDS if name in prediction})
+    text, file = io.StringIO(), stem.with_name(f"{stem.name}.force.csv")
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for t, number in enumerate(prediction["frame"]):
@@ -135,7 +149,8 @@ def write_prediction(prediction: dict[str, Any], stem: Path) -> None:
         numbers = (time, prediction["total_force_mn"][t], *force, *ends)
         values = [f"{value:.6g}" if np.isfinite(value) else "" for value in numbers]
         table.writerow([int(number), values[0], int(prediction["trusted"][t]), *values[1:]])
-    write_whole(stem.with_name(f"{stem.name}.force.csv"), text.getvalue(), durable=False)
+    write_whole(file, text.getvalue(), durable=False)
+    return file
 
 
 def write_overlay(prediction: dict[str, Any], source: Path, stem: Path) -> Path | None:

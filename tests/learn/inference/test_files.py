@@ -197,7 +197,8 @@ def vector(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_dataset_gives_the_three_files(dataset: Path, vector: Path, tmp_path: Path) -> None:
     shutil.copytree(dataset / "000000.zarr", tmp_path / "data/000000.zarr")
-    run(app, "predict", vector, tmp_path / "data", "--out", tmp_path)
+    result = run(app, "predict", vector, tmp_path / "data", "--out", tmp_path)
+    assert str(tmp_path / "000000.force.csv") in result.output
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["000000.force.csv", "000000.force.mp4", "000000.npz", "data"]
     sequence = Dataset(dataset)[0]
