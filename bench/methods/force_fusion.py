@@ -28,7 +28,7 @@ class Fusion:
     def __init__(self, network: str, physics: str) -> None:
         """Names of the two methods."""
         self.parts = network, physics
-        self._share, self._alone = 0.0, 0
+        self._share, self._alone = np.nan, 0
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: a fusion needs the estimates of its parts."""
@@ -66,12 +66,14 @@ class Fusion:
             # What neither sees stays as likely as physics has it, however sure the network is.
             fusions.append(ForceEstimate(mean, expected_mn=prior.centre_at(mean).find_size(cameras)))
             weighted_squares, squares = weighted_squares + weight * square, squares + square
-        self._share = weighted_squares / squares if squares else 0.0
+        self._share = weighted_squares / squares if squares else np.nan
         return fusions
 
     @property
     def notes(self) -> list[str]:
-        """The weights of the two methods over the video."""
+        """The weights of the two methods over the video, unless they are nowhere fused or nowhere differ."""
+        if np.isnan(self._share):
+            return []
         (network, physics), share = self.parts, self._share
         return [f"weights where they differ: {network} {share:.0%}, {physics} {1 - share:.0%}"]
 

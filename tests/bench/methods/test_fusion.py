@@ -32,6 +32,15 @@ def test_gaussians_are_weighted_by_their_precisions_and_the_network_alone_withou
     np.testing.assert_array_equal(network_only.force_mn, a)
 
 
+def test_weights_are_told_only_where_frames_are_fused() -> None:
+    network, physics = (estimate([np.full(3, size)], [0.5], [1.0]) for size in (3.0, 1.0))
+    for part, is_fused in ((physics, True), (ForceEstimate(np.ones(3)), False)):
+        fusion = Fusion("network", "physics")
+        fusion.fuse([{"network": network, "physics": part}], SCENE, 2)
+        assert bool(fusion.notes) == is_fused
+        assert bool(fusion.warnings) != is_fused
+
+
 def test_components_that_contradict_the_network_lose_weight() -> None:
     near_force, far_force = np.array([2.0, 0.0, 0.0]), np.array([5.0, 0.0, 0.0])
     physics = estimate([near_force, far_force], [0.8, 0.8], [0.3, 0.7]).likely
