@@ -1,5 +1,6 @@
 """Recordings scored by `bench score`, and pooled on a page by `bench pool`."""
 
+import hashlib
 import shlex
 import shutil
 import subprocess
@@ -35,20 +36,32 @@ def copy_left(stereo: Path, mono: Path) -> None:
 
 
 def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
-    """Scores each recording in FOLDER-score next to it, unless this code has, and writes the page into `out`.
+    """Scores each recording in FOLDER-score next to it, unless this code has scored the same files.
+
+    Writes the page into `out`.
 
     Raises UserError: a command failed, or no recording has valid numbers.
     """
     options = _OPTIONS[cameras]
     scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
     for folder, score in zip(recordings, scores, strict=True):
-        key, key_file = result_cache.key(*options), score / "code.key"
+        key, key_file = result_cache.key(*options, _hash_files(folder)), score / "inputs.key"
         if not key_file.is_file() or key_file.read_text("utf-8") != key:
             words = ("score", str(folder), *options, "-o", str(score))
+            (score / "score.json").unlink(missing_ok=True)
             code = subprocess.run([sys.executable, "-m", "bench", *words]).returncode
-            if code not in (0, _REFUSED):
+            if code not in (0, _REFUSED) or not (score / "score.json").is_file():
                 raise UserError(f"bench score: exit code {code}")
             checked_file.write_whole(key_file, key)
     line = shlex.join(["bench", "score", "RECORDING", *options])
     provenance = f"{report.command()}\n    {line}\n    bench pool SCORES"
     pool.write(pool.pool(pool.read(scores)), out, provenance)
+
+
+def _hash_files(folder: Path) -> str:
+    """Hash of the names and bytes of a folder's files."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(f"{file.relative_to(folder)} {file.stat().st_size} ".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

@@ -89,7 +89,7 @@ class Gains:
     size: Floats  # (K,) mN/kPa, rising
     low: Floats  # (K,)
     high: Floats  # (K,)
-    unsolved: int = 0  # states whose mechanics found no solution, or with one camera
+    unsolved: int = 0  # states without a plausible equilibrium, or with one camera
 
     def interpolate(self, size: float) -> tuple[float, float]:
         return float(np.interp(size, self.size, self.low)), float(np.interp(size, self.size, self.high))
@@ -252,7 +252,9 @@ class Physics:
         fault = "the surface is bent beyond the range of the linear inverse"
         if self._is_beyond:
             return [f"{fault}, with one camera and perhaps a membrane: forces may be many times larger"]
-        reason = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
+        reason = (
+            "with one camera" if len(self._weights.own_mm) == 2 else "and no plausible equilibrium is found"
+        )
         return [f"{fault}, {reason}: its largest forces are out of range, their intervals wide"]
 
     @property

@@ -26,7 +26,7 @@ from synth.flow.recording.decode import RecordingFlowSettings
 from synth.tune.search import change_job
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_stereo_stand_in_fits_its_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job_of, coarse = exvivo.job_of, {"fem.tets": 600, "anatomy.vertices": 4000}
     monkeypatch.setattr(exvivo, "job_of", lambda plan: change_job(job_of(plan), coarse))

@@ -1,6 +1,7 @@
 """Pooled scores, and scores that can't be pooled."""
 
 import json
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -83,20 +84,33 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
 def test_a_study_scores_recordings_once_for_each_version_of_the_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in "ab":
-        store(tmp_path / f"{name}-score", score(name, 2.0, name))
-    scored = list[str]()
+    recordings, scored, fails = [tmp_path / name for name in "ab"], list[str](), False
+    for recording in recordings:
+        recording.mkdir()
+        (recording / "meta.yaml").write_text("young_kpa: 1.0")
 
     def run_command(words: list[str]) -> subprocess.CompletedProcess[str]:
-        scored.append(Path(words[4]).name)
-        return subprocess.CompletedProcess(words, 0)
+        name = Path(words[4]).name
+        scored.append(name)
+        if not fails:
+            shutil.rmtree(tmp_path / f"{name}-score", ignore_errors=True)
+            store(tmp_path / f"{name}-score", score(name, 2.0, name))
+        return subprocess.CompletedProcess(words, 2 * fails)
 
     monkeypatch.setattr(pooled.subprocess, "run", run_command)
     for version in (1, 1, 2):
         monkeypatch.setattr(formats, "SCORING", version)
-        pooled.score_and_pool([tmp_path / name for name in "ab"], 1, tmp_path / "study")
+        pooled.score_and_pool(recordings, 1, tmp_path / "study")
     assert scored == ["a", "b", "a", "b"]
+    (recordings[1] / "meta.yaml").write_text("young_kpa: 2.0")
+    pooled.score_and_pool(recordings, 1, tmp_path / "study")
+    assert scored[4:] == ["b"]
     assert json.loads((tmp_path / "study" / "pool.json").read_text())["recordings"] == ["a", "b"]
+    (recordings[0] / "meta.yaml").write_text("young_kpa: 3.0")
+    fails = True
+    for _ in range(2):  # an old score is not taken for a new one
+        with pytest.raises(UserError):
+            pooled.score_and_pool(recordings, 1, tmp_path / "study")
 
 
 def test_one_page_of_several_recordings_links_each_and_says_why_one_is_missing() -> None:
