@@ -24,7 +24,7 @@ JOB = Job(seed=1, sequences=2, frames=5, render={"size": (64, 48)}, flow={"backe
 KINDS = (
     "bit", "bytes", "truncated", "emptied", "removed", "zeroed", "swapped", "rewritten", "edited", "key gone"
 )  # fmt: skip
-EACH = 5
+EACH = 4
 
 
 @pytest.fixture(scope="module")

@@ -248,7 +248,7 @@ def test_it_is_drawn_and_shades_where_it_touches(tmp_path: Path) -> None:
     assert light[0] < 0.95 * light[1]  # in its shadow
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_parts_and_workers_draw_it(tmp_path: Path) -> None:
     make_rod().export(tmp_path / "rod.stl")
     job = make_job(tmp_path / "rod.stl").model_copy(update={"sequences": 2, "frames": 3})
