@@ -144,7 +144,7 @@ def test_tested_sequences_are_held_out(
     assert used == {"fit": [*map(str, range(6, 12))], "select": ["4", "5"], "test": ["0", "1", "2", "3"]}
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_training_of_a_study_is_stored_and_reused(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,6 +200,7 @@ def test_the_gap_of_known_errors() -> None:
     assert summary["errors_mn"]["I"]["own, recovered"][0] == pytest.approx(0.2 * force.mean())
 
 
+@pytest.mark.trial
 def test_a_training_of_the_gap_keeps_the_errors_of_its_epochs(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     y, x = np.mgrid[-1:1:16j, -1:1:16j]

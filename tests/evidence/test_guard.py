@@ -33,8 +33,8 @@ NEUTRAL = (
     "synth/fit",
 )
 """Packages that pass values on, or whose values no study stores."""
-LONG = "score", "score-stereo", "wide-tissue", "pulse"
-"""Probes of whole scores, of many tissues."""
+LONG = "network", "score", "score-stereo", "wide-tissue", "pulse"
+"""Probes of trainings, of whole scores, of many tissues."""
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def test_the_force_behind_felupes_motion_is_found(scene: dict) -> None:  # type:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES[1:3], ids=lambda scene: f"{scene['alpha']:g}")
+@pytest.mark.parametrize("scene", SCENES[1:2], ids=lambda scene: f"{scene['alpha']:g}")
 def test_motion_that_is_hardly_known_imposes_less(scene: dict) -> None:  # type: ignore[type-arg]
     """Beside felupe's contact a strip is seen 1.5 mm off, as flow that is lost is."""
     grid = physics.GRID
