@@ -1,6 +1,5 @@
 """Recordings scored by `bench score`, and pooled on a page by `bench pool`."""
 
-import hashlib
 import shlex
 import shutil
 import subprocess
@@ -12,7 +11,7 @@ from bench.methods.comparison import PHYSICS
 from bench.recording import recording_writer
 from bench.recording.meta import read_meta
 from bench.scoring import pool
-from evidence import report, result_cache
+from evidence import report, result_cache, result_status
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -45,7 +44,8 @@ def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
     options = _OPTIONS[cameras]
     scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
     for folder, score in zip(recordings, scores, strict=True):
-        key, key_file = result_cache.key(*options, _hash_files(folder)), score / "inputs.key"
+        key = result_cache.key(*options, result_status.content(folder, ("*",)))
+        key_file = score / "inputs.key"
         if not key_file.is_file() or key_file.read_text("utf-8") != key:
             words = ("score", str(folder), *options, "-o", str(score))
             (score / "score.json").unlink(missing_ok=True)
@@ -56,12 +56,3 @@ def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
     line = shlex.join(["bench", "score", "RECORDING", *options])
     provenance = f"{report.command()}\n    {line}\n    bench pool SCORES"
     pool.write(pool.pool(pool.read(scores)), out, provenance)
-
-
-def _hash_files(folder: Path) -> str:
-    """Hash of the names and bytes of a folder's files."""
-    digest = hashlib.blake2b(digest_size=16)
-    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(f"{file.relative_to(folder)} {file.stat().st_size} ".encode())
-        digest.update(file.read_bytes())
-    return digest.hexdigest()

@@ -104,10 +104,11 @@ def write_states(results: Path = RESULTS) -> None:
             write_whole(page, text[:end] + line + text[end:], durable=False)
 
 
-def content(path: Path) -> str:
-    """Hash of a file's content, or of all JSON and YAML files of a folder, which include hashes of arrays."""
+def content(path: Path, patterns: Sequence[str] = ("*.json", "*.yaml")) -> str:
+    """Hash of a file, or of a folder's files: by default JSON and YAML, which hold hashes of arrays."""
     total = hashlib.blake2b(digest_size=8)
-    files = [path] if path.is_file() else [p for kind in ("json", "yaml") for p in path.rglob(f"*.{kind}")]
+    found = [path] if path.is_file() else [p for pattern in patterns for p in path.rglob(pattern)]
+    files = [file for file in found if file.is_file()]
     for file in sorted(files):
         total.update(f"{file.relative_to(path)}\n".encode() + file.read_bytes())
     return total.hexdigest()

@@ -1,6 +1,6 @@
 """Discretisation error of default scenes: the default mesh against refined ones."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -14,7 +14,7 @@ from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.mesh_relief import HeightMap
 from synth.job.schema import Job
-from synth.sequence.rest_scene import at_rest
+from synth.sequence.rest_scene import RestScene, at_rest
 
 Row = dict[str, Any]
 _JOB = Job(sequences=1000)
@@ -26,13 +26,18 @@ def measure(scenes: int = 40, tets: str = "1600,5000,20000") -> Row:
     `scenes`: number of scenes of the default job; `tets`: tetrahedra, the last is the reference.
     """
     sizes = [int(n) for n in tets.split(",")]
-    rows = [measure_scene(index, count) for count in reversed(sizes) for index in range(scenes)]
+    rows = [row for index in range(scenes) for row in measure_scene(index, sizes)]
     return {"summary": summarise(rows, sizes), "rows": rows}
 
 
-def measure_scene(index: int, count: int) -> Row:
-    """Largest and load-weighted mean displacement [mm] of a scene at full load, reached in two steps."""
+def measure_scene(index: int, sizes: Sequence[int]) -> list[Row]:
+    """`_measure_mesh` of a scene with each number of tetrahedra."""
     rest = at_rest(_JOB, index)
+    return [_measure_mesh(rest, index, count) for count in sizes]
+
+
+def _measure_mesh(rest: RestScene, index: int, count: int) -> Row:
+    """Largest and load-weighted mean displacement [mm] of a scene at full load, reached in two steps."""
     case, surface = rest.scenario, rest.surface
     gesture, height = case.gestures[0], HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}

@@ -126,8 +126,7 @@ def predict_files(
         if len(trusted):
             strongest = trusted[size[trusted].argmax()]
             peak = float(size[strongest])
-            if all(end in prediction for end in _ENDS):
-                interval = float(prediction[_ENDS[0]][strongest]), float(prediction[_ENDS[1]][strongest])
+            interval = _read_interval(prediction, strongest)
         yield PredictedFile(motion.name, count, peak, interval, table, prediction["notes"].tolist())
 
 
@@ -145,12 +144,17 @@ def write_prediction(prediction: dict[str, Any], stem: Path) -> Path:
     for t, number in enumerate(prediction["frame"]):
         time = prediction["time_s"][t] if "time_s" in prediction else np.nan
         force = prediction["force_mn"][t] if "force_mn" in prediction else (np.nan,) * 3
-        ends = [prediction[name][t] if name in prediction else np.nan for name in _ENDS]
-        numbers = (time, prediction["total_force_mn"][t], *force, *ends)
+        numbers = (time, prediction["total_force_mn"][t], *force, *_read_interval(prediction, t))
         values = [f"{value:.6g}" if np.isfinite(value) else "" for value in numbers]
         table.writerow([int(number), values[0], int(prediction["trusted"][t]), *values[1:]])
     write_whole(file, text.getvalue(), durable=False)
     return file
+
+
+def _read_interval(prediction: dict[str, Any], t: int) -> tuple[float, float]:
+    """Ends of the 90% interval of a frame's force [mN]; NaN: none."""
+    low, high = (float(prediction[name][t]) if name in prediction else np.nan for name in _ENDS)
+    return low, high
 
 
 def write_overlay(prediction: dict[str, Any], source: Path, stem: Path) -> Path | None:

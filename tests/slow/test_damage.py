@@ -24,7 +24,7 @@ JOB = Job(seed=1, sequences=2, frames=5, render={"size": (64, 48)}, flow={"backe
 KINDS = (
     "bit", "bytes", "truncated", "emptied", "removed", "zeroed", "swapped", "rewritten", "edited", "key gone"
 )  # fmt: skip
-EACH = 4
+EACH = 5
 
 
 @pytest.fixture(scope="module")

@@ -102,7 +102,7 @@ def test_the_tissues_own_motion_is_estimated_from_contact_free_frames(basis: Loa
 
 @pytest.mark.slow
 def test_intervals_have_90_percent_coverage_of_draws_from_the_model(basis: LoadBasis) -> None:
-    rng, inside, count, model = np.random.default_rng(2), 0, 100, posterior.MODEL
+    rng, inside, count, model = np.random.default_rng(2), 0, 150, posterior.MODEL
     sizes = np.repeat([0.02, 0.02, 0.05], 6)
     modes = np.diag(sizes).reshape(3, 6, 18)
     for _ in range(count):
